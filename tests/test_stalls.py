@@ -26,7 +26,7 @@ RATE = 250.0  # [Hz]
 
 
 def swing(t: float) -> Array:
-    """Return the displacement at ``t`` [s] of a hand that swings so fast that the arms can just follow."""
+    """Return the displacement at ``t`` [s] of a hand that swings about as fast as the arms can follow."""
     return np.array([0.0, 0.12 * np.sin(6.0 * max(t - 0.5, 0.0)), 0.0, 0.0, 0.0, 0.0])
 
 

@@ -505,8 +505,8 @@ class Pipeline(RequestedRun):
         step = self.loop.step(state, poses, now, dt, grippers, openings, braked, self._posture())
         self._grippers = step.grippers
         for refusal in step.refusals.values():
-            # Without this pause, the operator would think that the arm follows. Operator and recording get the fault that
-            # stopped the arms, and not only the phase of the controller to which the fault has led.
+            # Without this pause, the operator would think that the arm follows. Operator and recording get the fault
+            # that stopped the arms, and not only the phase of the controller to which the fault has led.
             ceased = self.supervisor.ceased if refusal.kind is SupervisionReason.CONTROLLER_PHASE else None
             self.teleop.pause(now, refusal if ceased is None else ceased.root)
         for reason in self.supervisor.events:

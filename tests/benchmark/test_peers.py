@@ -63,8 +63,8 @@ def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_our_controller(pe
     peer.reset(ROBOT.home)
     goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in HOME.items()}
     _, v = peer.step(goals, DT)
-    # The solver of roboplan may be off by 1e-6 rad in a tick, which is a tenth of what the limit allows. The test
-    # therefore permits a quarter more than the limit.
+    # In this tick, the limit allows a motion of 1e-5 rad. The solution of roboplan may have an error of 1e-6 rad. The
+    # test therefore permits a quarter more than the limit.
     limit = ROBOT.capped_acceleration(CONFIG.control.acceleration_limit)
     assert (np.abs(v) <= 1.25 * limit * DT).all()
 

@@ -1,4 +1,4 @@
-"""The comparison of solvers measures DAQP and each installed solver in one motion, and names those that are missing."""
+"""The comparison of solvers measures DAQP and each installed solver in one motion, and names missing solvers."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def test_a_picture_has_the_time_that_the_driver_stamped_if_this_time_is_possible
 class Stream(BaseHTTPRequestHandler):
     """A network camera that sends Motion JPEG over HTTP. Each picture shows its own number."""
 
-    sent: dict[int, float]  # By number, the time just before the picture was sent [s].
+    sent: dict[int, float]  # For each picture's number, the time just before it was sent [s].
     paths: list[str]  # The paths of all requests.
 
     def do_GET(self) -> None:
@@ -107,6 +107,6 @@ def test_an_error_about_an_address_does_not_contain_its_password() -> None:
     assert "secret" not in str(error.value)
 
 
-def test_the_fault_of_a_name_that_is_no_camera_gives_the_reason() -> None:
+def test_the_function_fault_of_says_why_a_name_is_not_the_name_of_a_camera() -> None:
     assert str(fault_of("/dev/video250")).startswith("no such device; allowed: ")
     assert fault_of("/dev/null") == "no camera: it is no V4L2 device"

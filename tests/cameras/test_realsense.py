@@ -66,7 +66,7 @@ def test_without_depth_only_the_colour_picture_is_read_and_turned(clock: Stopped
     device.close()
 
 
-def test_it_is_a_fault_if_only_one_of_two_streams_falls_silent(clock: StoppedClock) -> None:
+def test_it_is_a_fault_if_the_depth_stream_falls_silent_and_the_colour_stream_goes_on(clock: StoppedClock) -> None:
     source = SoftwareRealSense()
     device = RealSense(camera(depth=True), source.device)
     clock.passed = 2.5

@@ -162,7 +162,7 @@ def test_check_refuses_a_filtered_cell_whose_operator_moves_another_frame_than_t
     assert "allowed: a frame at the tool, or null with left_tool_frame on /tf" in result.stderr
 
 
-def test_check_as_json_has_limits_and_distances_in_order() -> None:
+def test_the_json_of_check_has_limits_and_the_distances_of_pairs_in_ascending_order() -> None:
     cell = one_object(q2r2("check", CELL, "--json").stdout)
     assert [arm["name"] for arm in cell["arms"]] == ["left", "right"]
     joint = cell["arms"][0]["joints"][0]
@@ -318,7 +318,7 @@ def test_check_says_which_pairs_may_touch() -> None:
         ((31.2e-6, 31.1e-6), "320 pairs instead of 193"),
     ],
 )
-def test_the_text_about_additional_shapes_has_times_only_if_ticks_take_longer_with_these_shapes(
+def test_the_text_about_additional_shapes_contains_times_only_if_the_shapes_make_ticks_longer(
     ticks: tuple[float, float], says: str
 ) -> None:
     assert cost_of_shapes((320, 193), ticks) == says
@@ -330,7 +330,7 @@ def test_pairs_that_can_never_meet_are_written_to_new_files_only(tmp_path: Path)
     assert file.read_text(encoding="utf-8") == "mine"
 
 
-def test_a_file_of_pairs_that_cannot_be_written_is_refused_before_the_samples(tmp_path: Path) -> None:
+def test_a_file_of_pairs_that_cannot_be_written_is_refused_before_postures_are_sampled(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refused = q2r2("check", CELL, "--pairs", str(tmp_path / "file" / "a.srdf"), "--samples", "1000000000")
     assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)

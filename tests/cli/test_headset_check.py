@@ -76,7 +76,7 @@ def test_a_host_outside_the_networks_in_headset_allow_is_refused(tmp_path: Path)
             assert b"127.0.0.1 is not in headset.allow" in headset.read_until("__error")
         running.send_signal(signal.SIGINT)
         assert running.stderr is not None
-        stderr = running.stderr.read()  # The text contains what was read ahead after the line with the address.
+        stderr = running.stderr.read()  # These are all lines after the line with the address.
     assert "only 10.0.0.0/8 can drive the arms" in stderr
 
 

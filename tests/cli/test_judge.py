@@ -55,7 +55,7 @@ def test_the_json_of_judge_has_every_figure_and_every_reason(recordings: Path, t
     assert [episode["verdict"] for episode in episodes] == ["keep", "keep"]
 
 
-def test_a_name_of_the_table_is_whole_in_80_columns(recordings: Path) -> None:
+def test_the_table_contains_complete_names_of_recordings_in_80_columns(recordings: Path) -> None:
     judged = [one for file in sorted(recordings.rglob("*.mcap")) for one in judge(Recording(file))]
     name = "20261130-132353-demo"
     named = [replace(one, figures=replace(one.figures, file=f"{name}.mcap")) for one in judged]

@@ -44,7 +44,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         pytest.param("", "--left example-robot-data:go2", "branches at base", id="a robot of legs"),
     ],
 )
-def test_for_a_model_that_makes_no_cell_new_cell_prints_one_line_and_writes_no_file(
+def test_the_command_new_cell_prints_one_line_and_writes_no_file_for_a_model_that_cannot_be_in_a_cell(
     text: str, arguments: str, says: str
 ) -> None:
     Path("arm.urdf").write_text(text)
@@ -84,7 +84,7 @@ def test_a_fault_names_the_links_without_masses_and_a_line_says_that_these_masse
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", ["link_3", "link_0"], ids=["a link that moves", "the base"])
-def test_drawn_links_without_a_shape_are_monitored_with_capsules_around_their_drawings(
+def test_visible_links_without_collision_shapes_are_monitored_with_capsules_around_their_visual_geometry(
     link: str, tmp_path: Path
 ) -> None:
     Path("arm.urdf").write_text(re.sub(rf'<collision name="{link}.*?</collision>', "", IIWA, flags=re.DOTALL))
@@ -110,7 +110,7 @@ def test_if_a_fixed_part_of_the_robot_is_always_near_an_arm_this_pair_gets_its_o
 
 
 @pytest.mark.slow
-def test_if_a_drawing_cannot_be_enclosed_the_other_drawings_still_get_capsules(tmp_path: Path) -> None:
+def test_if_the_visual_geometry_of_a_link_cannot_be_enclosed_other_links_still_get_capsules(tmp_path: Path) -> None:
     bare = re.sub(r'<collision name="link_[03].*?</collision>', "", IIWA, flags=re.DOTALL)
     Path("points.obj").write_text("v 0 0 0\n")
     drawing = '<link name="link_0"><visual><geometry><mesh filename="points.obj"/></geometry></visual>'

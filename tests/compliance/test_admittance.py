@@ -81,7 +81,9 @@ AXES = pytest.mark.parametrize("axis", [0, 2, 4], ids=["along x", "along z", "ab
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("axis", "ratio", "dt"), [(0, 0.2, 0.001), (5, 0.6, 0.01)], ids=["moved", "turned"])
-def test_after_a_push_the_target_returns_with_the_set_damping_ratio(axis: int, ratio: float, dt: float) -> None:
+def test_after_a_push_the_target_returns_with_the_damping_ratio_of_the_settings(
+    axis: int, ratio: float, dt: float
+) -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))
     _displaced(admittance, _touch(_wrench(axis, 20.0 if axis < 3 else 5.0)), round(4.0 / dt), dt)
     back = np.array(_displaced(admittance, UNTOUCHED, round(1.5 / dt), dt))[:, axis]
@@ -110,7 +112,7 @@ def test_a_force_below_the_dead_band_never_moves_the_tool(axis: int) -> None:
 
 
 @pytest.mark.slow
-def test_beyond_the_dead_band_the_displacement_grows_gradually_to_the_value_for_the_whole_force() -> None:
+def test_beyond_the_dead_band_the_displacement_grows_gradually_to_the_force_divided_by_the_stiffness() -> None:
     forces = np.linspace(1.5, 30.0, 115)
     ends = np.array([_displaced(Admittance(ROBOT), _touch(_wrench(0, force)), 100, 0.1)[-1][0] for force in forces])
     slopes = np.diff(ends) / np.diff(forces)
@@ -228,9 +230,9 @@ def _plant() -> MujocoPlant:
 
 
 def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[Array]:
-    """Yield at every tick the displacement (6,) of the left tool from its goal at the reference [m], [rad].
+    """Run the closed loop, and check the contract at every tick.
 
-    The contract is checked at every tick.
+    Yield at every tick the displacement (6,) [m], [rad] from the goal to the left tool pose of the reference.
     """
     controller, admittance, plant = CartesianController(ROBOT), Admittance(ROBOT), _plant()
     plant.reset()
@@ -302,7 +304,7 @@ def test_a_wrench_at_the_tool_is_estimated_exactly_in_every_posture_that_is_not_
         np.testing.assert_allclose(estimate_wrench(_jacobian(q), _jacobian(q).T @ wrench), wrench, atol=1e-8)
 
 
-def test_torques_that_no_wrench_explains_give_the_least_squares_wrench(regular: list[Array]) -> None:
+def test_for_torques_that_no_wrench_can_cause_the_estimate_is_the_least_squares_wrench(regular: list[Array]) -> None:
     random = np.random.default_rng(43)
     for q in regular:
         tau = random.normal(0.0, 10.0, 7)
@@ -318,7 +320,8 @@ def test_for_a_stretched_arm_the_estimate_is_bounded_and_has_no_force_along_the_
         bent = upright.copy()
         bent[3] = angle
         tau = random.uniform(-1.0, 1.0, 7)
-        # The inequality is f(s) = s / (s^2 + e^2 (1 - s^2/e^2)^2) <= 1.16 / e for e = 0.05.
+        # A torque in the direction of the singular value s gives a wrench that is f(s) times as large. With e = 0.05,
+        # f(s) = s / (s^2 + e^2 (1 - s^2/e^2)^2) <= 1.16 / e.
         assert np.linalg.norm(estimate_wrench(_jacobian(bent), tau) / SCALE) <= 1.16 / 0.05 * np.linalg.norm(tau)
 
 

@@ -67,7 +67,7 @@ class TestController:
         assert command.report.saturated == command.report.rate_limited == ("left_A6",)
         assert controller.step(reference(robot.home), at(robot.home), DT, np.full(14, np.nan)).report.held
 
-    def test_the_report_names_arms_whose_error_is_clipped_and_joints_that_their_limits_repel(
+    def test_the_report_names_arms_whose_error_is_clipped_and_joints_that_are_pushed_away_from_a_limit(
         self, robot: Robot
     ) -> None:
         controller, q = started(robot), robot.home.copy()
@@ -133,7 +133,7 @@ class TestController:
             assert not command.report.held
 
     @pytest.mark.parametrize(("dt", "change"), [(0.0, 0.0), (-1.0, 0.0), (np.nan, 0.0), (0.01, 10.0), (50.0, 100.0)])
-    def test_the_change_of_torque_is_limited_by_the_time_that_passed(
+    def test_the_torque_changes_by_at_most_the_rate_limit_times_dt(
         self, robot: Robot, dt: float, change: float
     ) -> None:
         controller = started(robot)
@@ -177,7 +177,7 @@ class TestAnImpedanceThatChanges:
             assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
             assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
-    def test_after_a_change_torques_equal_those_of_a_controller_that_was_made_with_the_new_settings(
+    def test_after_a_change_torques_equal_the_torques_of_a_controller_that_was_made_with_the_new_settings(
         self, robot: Robot
     ) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}

@@ -33,7 +33,7 @@ def tool_inertia(J: Array, M: Array) -> Array:
 
 
 def projector_of(J: Array, M: Array) -> Array:
-    """Return the nullspace projector N (n, n), column by column."""
+    """Return the nullspace projector N (n, n). Each column is the projection of a unit torque."""
     J, inertia, M_inverse = np.ascontiguousarray(J), tool_inertia(J, M), np.linalg.inv(M)
     consistent = [torque - J.T @ consistent_force(inertia, J, M_inverse, torque) for torque in np.eye(len(M))]
     return np.column_stack(consistent)
@@ -57,7 +57,7 @@ class TestASingularPosture:
         heaviest = np.linalg.eigvalsh(tool_inertia(J, M) / np.outer(root, root)).max()
         assert heaviest == pytest.approx(1000.0)
 
-    def test_the_projector_neither_jumps_nor_amplifies_without_bound(self) -> None:
+    def test_near_a_singular_posture_the_projector_does_not_jump_and_its_entries_are_bounded(self) -> None:
         projectors = []
         for bend in np.linspace(-0.02, 0.02, 41):
             q = STRETCHED.copy()
@@ -75,7 +75,7 @@ class TestLimitRepulsion:
         assert np.ptp(torques) == 0
         return float(torques[0])
 
-    def test_the_limit_torque_acts_like_a_spring_that_begins_before_the_limit_or_at_the_reference(self) -> None:
+    def test_the_limit_torque_is_a_spring_that_starts_0_1_rad_before_the_limit_or_at_a_nearer_reference(self) -> None:
         assert [self.torque(q) for q in (-0.9, 0.0, 0.9)] == [0.0, 0.0, 0.0]
         assert [self.torque(q) for q in (0.95, -0.95, 1.1)] == pytest.approx([-15.0, 15.0, -60.0])
         assert [self.torque(q, wanted=0.97) for q in (0.97, 0.98)] == pytest.approx([0.0, -3.0])
@@ -145,7 +145,7 @@ def arm_torque(
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5], ids=["near", "further than the clip"])
-def test_the_torque_of_the_controller_equals_that_of_the_formulas_in_the_papers(spread: float) -> None:
+def test_the_torque_of_the_controller_equals_the_torque_of_the_formulas_in_the_papers(spread: float) -> None:
     random = np.random.default_rng(7)
     settings = ImpedanceSettings(damping_ratio=0.7, limit_distance=1e-3, torque_rate_limit=1e5)
     controller = ImpedanceController(ROBOT, settings)

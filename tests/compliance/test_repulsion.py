@@ -78,12 +78,12 @@ def test_the_torque_at_rest_is_the_negative_gradient_of_the_energy_of_the_wall(
         assert np.abs(report.tau).max() > 0.0
 
 
-def test_the_energy_equals_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
+def test_the_energy_equals_the_energy_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
     stiffness = WallSettings().stiffness
     for q, report in _postures()[:100]:
         depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
         spring = 0.5 * stiffness * float((depth**2).sum())
-        # Smooth distances are up to 0.3 mm longer than exact ones.
+        # Smooth distances are up to 0.3 mm longer than exact distances.
         least = 0.5 * stiffness * float((np.maximum(depth - 3e-4, 0.0) ** 2).sum())
         assert least - 1e-9 <= report.energy <= spring + 1e-4
 
@@ -289,7 +289,7 @@ def test_an_arm_that_is_pushed_with_40_newtons_towards_the_other_arm_never_touch
     assert released[-1] < 0.7 * released[0]
 
 
-def test_a_wall_whose_distances_changed_pushes_like_a_wall_made_with_these_distances() -> None:
+def test_a_wall_that_gets_new_kept_distances_pushes_like_a_wall_that_was_made_with_these_distances() -> None:
     wider = ControllerSettings(min_distance=0.04)
     made, told = MeasuredSeparation(ROBOT, wider), MeasuredSeparation(ROBOT, ControllerSettings())
     q = _postures()[0][0]
@@ -298,7 +298,7 @@ def test_a_wall_whose_distances_changed_pushes_like_a_wall_made_with_these_dista
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
 
 
-def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_is_removed() -> None:
+def test_an_arm_that_is_pushed_towards_a_new_box_does_not_touch_the_box_until_the_box_is_removed() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
     separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
     at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])
@@ -327,7 +327,7 @@ def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_
 
 
 @pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
-def test_the_wall_pushes_no_arm_away_from_an_obstacle_that_may_move(with_object: bool) -> None:
+def test_the_wall_pushes_an_arm_away_from_an_obstacle_only_if_its_reported_speed_is_0(with_object: bool) -> None:
     robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
     controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
     separation = MeasuredSeparation(robot, controller.settings)

@@ -1,4 +1,4 @@
-"""Files of cells for tests: the shipped one with changes, and the message about a fault in a file."""
+"""Functions for tests of cell files: they change the shipped cell, and return the error message about a file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def loaded(tmp_path: Path, text: str | bytes) -> Config:
 
 
 def fault(tmp_path: Path, text: str | bytes) -> str:
-    """Return the message about a faulty cell without the file's name and the line's number."""
+    """Load a faulty cell with ``text``. Return the error message without the file's name and the line's number."""
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path, text)
     message = str(caught.value)

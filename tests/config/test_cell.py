@@ -59,7 +59,7 @@ def test_the_error_about_an_unknown_key_of_a_gripper_lists_the_keys_for_grippers
     assert f"allowed here: {allowed}" in message
 
 
-def test_the_velocity_scale_of_a_fri_cell_is_so_small_that_catching_up_keeps_the_velocity_limits(
+def test_the_velocity_scale_of_a_fri_cell_keeps_velocity_limits_while_commands_catch_up_after_a_delay(
     tmp_path: Path,
 ) -> None:
     def scale(given: float) -> float:
@@ -126,13 +126,13 @@ def test_a_misspelt_key_is_named_before_the_key_that_is_therefore_missing(tmp_pa
         ("headset.allow", ["192.168.1.7/24"], "write 192.168.1.0/24, or 192.168.1.7 alone"),
         ("headset.allow", ["10.0.0.7", "the lab"], "'the lab' is neither an address nor a network such as"),
         ("arms.left.gripper.closed_position", 0.025, "have to differ"),
-        # Values that are not numbers, or not the intended ones, are refused.
+        # NaN, texts instead of numbers, and names that are not allowed are refused.
         ("control.acceleration_limit", math.nan, "finite number"),
         ("control.position_margin", "0.01 rad", "allowed: a number"),
         ("recording.topic_rate", "fast", "allowed: a number, or null"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
         ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
-        # These values belong to a cell with another controller.
+        # The next faults are in the keys for an external controller.
         ("controller", "kuka", "'builtin' or 'external'"),
         ("external.preset", "kuka", "allowed are kuka_lbr_clik, kuka_lbr_impedance, fzi, mayr, crisp, moveit_servo, "),
         ("external.rate", 20, "preset kuka_lbr_clik needs at least 50 Hz"),
@@ -206,7 +206,7 @@ def test_each_fault_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
         (15, "obstacles.table.pose"),
         (16, "colour"),
         (7, "arms.left.home.1"),
-        (14, "obstacles.table.shape"),  # The key is missing, so the line is that of its block.
+        (14, "obstacles.table.shape"),  # The key is missing, so the error names the line of its block.
         (14, "obstacles.table.size"),
     ]
     with pytest.raises(ConfigError) as of_no_file:
@@ -245,14 +245,14 @@ def test_a_mapping_can_be_merged_into_another_mapping_which_replaces_some_of_its
         ("arms.left.tool", {}, None),
     ],
 )
-def test_a_tool_frame_that_the_file_names_gets_the_prefix_of_its_side(
+def test_the_name_of_a_tool_frame_in_the_file_gets_the_prefix_of_its_side(
     tmp_path: Path, path: str, value: object, frame: str | None
 ) -> None:
     config = loaded(tmp_path, changed(path, value))
     assert config.named_tool_frame("left") == frame
 
 
-def test_addresses_and_networks_that_may_connect_are_read_as_ip_networks(tmp_path: Path) -> None:
+def test_addresses_and_networks_from_which_headsets_may_connect_are_read_as_ip_networks(tmp_path: Path) -> None:
     headset = loaded(tmp_path, changed("headset.allow", ["192.168.1.0/24", "10.0.0.7", "fd00::/64"])).headset
     assert headset.networks == tuple(map(ip_network, ("192.168.1.0/24", "10.0.0.7/32", "fd00::/64")))
     assert loaded(tmp_path, changed("headset.allow", None)).headset.networks is None

@@ -48,6 +48,6 @@ def test_the_mount_is_replaced_and_all_other_keys_and_comments_stay(text: str) -
         pytest.param("[]", id="no cell"),
     ],
 )
-def test_a_mount_without_a_block_of_its_own_is_refused(text: str) -> None:
+def test_a_mount_is_refused_if_the_file_has_no_mount_block_for_only_this_arm(text: str) -> None:
     with pytest.raises(ConfigError, match=r"arms\.right\.mount: no block of its own"):
         with_mount(text, "right", POSITION, RPY)

@@ -61,7 +61,7 @@ def test_every_file_of_config_and_robots_is_part_of_the_installation() -> None:
 
 @pytest.mark.slow
 def test_shipped_files_installed_beside_the_package_are_found_without_the_checkout(tmp_path: Path) -> None:
-    """The layout is that of pip with --target. The test runs in its own process."""
+    """The files lie as after pip install --target. The test runs in its own process."""
     shutil.copytree(CHECKOUT / "q2r2_control", tmp_path / "q2r2_control", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in ("config", "robots"):
         shutil.copytree(CHECKOUT / folder, tmp_path / "share" / "q2r2_control" / folder)

@@ -34,7 +34,7 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
 def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iterator[tuple[str, type[BaseModel], Any]]:
     """Yield the path, the model and the data of every block of a file.
 
-    If the user chooses the names of blocks, as for obstacles, only the first block is shown.
+    If the user chooses the names of blocks, as for obstacles, only the first of these blocks is yielded.
     """
     yield place, model, data
     for key, field in model.model_fields.items():
@@ -50,7 +50,7 @@ def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iter
 class TestTheShippedCellShowsAllThereIsToTune:
     # Keys whose value differs from the default. A comment in the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    # Blocks whose keys another block of the same kind shows, such as an arm's mount.
+    # Blocks that may lack keys, because another block of the same kind lists all keys, such as an arm's mount.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
 
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
@@ -58,7 +58,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
         lines = text.splitlines()
         for place, model, data in shown(Config, read_yaml(text)):
             if place == "arms.left" and "robot:" in text:
-                continue  # The arms are parts of the shared robot.
+                continue  # The block robot contains the arms, so this block lacks some keys.
             for key in model.model_fields:
                 path = f"{place}.{key}".lstrip(".")
                 if path in self.SHOWN_ELSEWHERE:

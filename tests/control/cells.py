@@ -121,13 +121,13 @@ def reused_data(name: str, q: Array, v: Array | None = None) -> KernelData:
 
 @cache
 def _reused(name: str) -> tuple[KernelData, list[tuple[Array, Array]]]:
-    """Return kernel data, and all arrays in them, each with a copy of its content in new data."""
+    """Make kernel data once for each cell. Return them, and all their arrays, each with a copy of its first content."""
     new = KernelData.empty(kernel_model(name))
     return behind(new), [(array, array.copy()) for array in _arrays_in(new)]
 
 
 def _arrays_in(value: Any) -> Iterator[Array]:
-    """Yield the arrays in a named tuple, also those behind pointers."""
+    """Yield all arrays in a named tuple, and all arrays to which its pointers lead."""
     if isinstance(value, np.ndarray):
         yield value
     elif isinstance(value, KernelPointer):

@@ -92,7 +92,7 @@ class Coal:
 class Hunt:
     """A moving obstacle (sphere or box) that chases the nearest body at full speed, and moves at random in between.
 
-    Each body that moves is checked in the middle and at the end of every tick. It must keep its distance from the
+    Each body that moves is checked in the middle and at the end of every tick. The body must keep its distance from the
     obstacle, or must not approach the reported position of the obstacle. All other pairs must keep their distances too.
     The solver returns deliberately bad solutions.
     """
@@ -110,7 +110,7 @@ class Hunt:
         solver.kept = self.coal.kept
         self.at = robot.tool_pose(robot.home, "left").translation + np.array([0.0, 0.9, 0.0])
         self.velocity, self.way = np.zeros(3), np.zeros(3)
-        self.broken: list[float] = []  # By how much a moving body was too close to the hand, for each violation [m].
+        self.broken: list[float] = []  # Missing distance between a moving body and the hand in each violation [m].
         self.nearest_moving, self.touched, self.moved, self.retreats = np.inf, 0, 0, 0
 
     def run(self, seconds: float, speed: float, period: float, acceleration: float | None = None) -> None:

@@ -1,6 +1,6 @@
 """Named hostile motions of the targets. Each function returns the targets at the time t [s].
 
-Its second argument has the tool poses at the start, by arm.
+Its second argument has the tool pose of each arm at the start.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A program's own constraints are rows of the QP. Every step except the certified stop satisfies the hard ones.
+"""A program can add constraints, which become rows of the QP. Every step except the certified stop satisfies hard rows.
 
 The contract holds whatever a constraint returns.
 """
@@ -71,7 +71,7 @@ NONSENSE: dict[str, Callable[[int], Any]] = {
 
 
 def driven(controller: CartesianController, ticks: int) -> tuple[Array, Array]:
-    """Return velocities and postures of a run to crossing targets. The contract is checked at every tick."""
+    """Return velocities and postures of a run whose targets cross each other. The contract is checked at every tick."""
     contract = Contract(controller, controller.robot.home)
     v, q = [], []
     for tick in range(ticks):
@@ -109,7 +109,7 @@ class Plane:
         return J, np.array([-5.0 * room])
 
 
-def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_it_would_otherwise_cross(robot: Robot) -> None:
+def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_the_elbow_would_otherwise_cross(robot: Robot) -> None:
     _, q = driven(CartesianController(robot), 600)
     plane = Plane(robot, 0.0)
     heights = [plane.elbow(at) for at in q]
@@ -133,7 +133,7 @@ def test_if_no_step_satisfies_a_hard_row_the_arms_brake_and_the_report_names_the
     assert (LimitKind.CONSTRAINT, ("Answers",)) in reference.report.binding
 
 
-def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -> None:
+def test_a_given_solution_that_violates_a_hard_row_is_not_executed(robot: Robot) -> None:
     controller = CartesianController(robot, constraints=[StillJoint(3, hard=True)])
     for tick in range(100):
         targets = crossing(robot, tick)
@@ -146,7 +146,7 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
 
 
 class NoLess:
-    """A constraint: in the direction of ``along``, the next joint velocities are at least as fast as ``along``."""
+    """A constraint: in the direction of ``along`` (nv,), the next joint velocities are at least ``along``."""
 
     hard = True
     along: Array | None = None
@@ -157,7 +157,7 @@ class NoLess:
         return self.along[None, :], np.array([self.along @ self.along])
 
 
-def test_if_the_certified_part_of_a_solution_breaks_a_hard_row_the_certified_stop_is_executed_exactly(
+def test_if_the_certified_part_of_a_solution_violates_a_hard_row_the_certified_stop_is_executed_exactly(
     robot: Robot,
 ) -> None:
     """The given solutions ignore all pairs, so that often only a part of a solution can be certified.

@@ -71,7 +71,7 @@ def test_a_body_that_must_not_touch_the_table_keeps_its_distance_while_another_b
 
 @pytest.mark.slow
 def test_fingers_of_both_hands_can_touch_each_other_if_the_settings_allow_it() -> None:
-    """The hands face each other, and their targets cross over. The fingers enter each other up to the depth."""
+    """The hands face each other, and their targets cross over. The fingers enter each other up to the allowed depth."""
     depth = 0.005
     controller = CartesianController(ROBOT, settings({"pair": ["*finger*", "*finger*"], "depth": depth}))
 

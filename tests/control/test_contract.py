@@ -169,7 +169,7 @@ def test_the_report_names_the_limits_that_hold_the_arms_back(controller: Cartesi
 
 
 def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack: str, seed: int) -> float:
-    """Return the least margin of a pair at any tick, measured by Coal [m]. Check that every tick is certified."""
+    """Return the least margin of all pairs at all ticks [m], measured by Coal. Check that every tick is certified."""
     solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(seed)))
     controller = CartesianController(robot, settings, solver=untimed(solver, robot.model.nv))
     solver.kept, solver.q = controller.kept_distances, robot.home
@@ -195,7 +195,7 @@ def test_no_attacking_solver_brings_a_pair_closer_than_its_kept_distance(attack:
     assert -ROUNDING <= least < 1e-4, "it has to get there, and no further"
 
 
-def test_a_pair_too_close_by_a_rounding_error_keeps_its_certificate_and_opens_to_its_buffer() -> None:
+def test_if_a_pair_is_too_close_by_a_rounding_error_all_steps_are_certified_and_the_pair_opens_to_its_buffer() -> None:
     robot = robot_of("iiwa7")
     nearest = float(robot.distance_values(robot.home).min())
     settings = ControllerSettings(min_distance=nearest + 1e-15)

@@ -42,7 +42,7 @@ def test_a_stream_of_targets_is_followed_on_a_straight_line_at_the_speed_of_the_
     assert late.max() < 2.3 / rate
 
 
-def test_a_target_is_passed_on_at_once_if_every_step_has_a_new_target_or_the_last_was_held_long() -> None:
+def test_a_target_is_passed_on_at_once_if_every_step_has_a_new_target_or_the_last_target_was_held_long() -> None:
     held = HeldTargets()
     for step in range(20):
         assert followed(held, new := pose(0.001 * step)) == new

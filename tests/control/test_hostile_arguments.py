@@ -108,7 +108,7 @@ def test_targets_that_are_not_a_mapping_are_refused_and_nothing_moves(
     ids=["reset q", "reset v", "hold_at", "withdraw", "change distance", "change gain", "tool_pose", "opening arm",
          "opening from", "opening to", "holding arm", "obstacle name", "obstacle"],
 )  # fmt: skip
-def test_calls_other_than_a_tick_raise_only_our_errors_and_the_next_tick_keeps_the_contract(
+def test_calls_other_than_a_tick_raise_only_errors_of_this_package_and_the_next_tick_keeps_the_contract(
     robot: Robot, controller: CartesianController, shared_contract: Contract, hostile: Any, call: Any
 ) -> None:
     controller.reset(robot.home)

@@ -49,7 +49,9 @@ def test_a_kernel_that_only_other_kernels_call_has_no_machine_code_of_its_own(ch
         assert library.get_pointer_to_function(compiled(part.parts).fndesc.llvm_func_name) == 0
 
 
-def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same_result(chain: tuple[Any, Any, Any]) -> None:
+def test_a_part_of_another_kernel_is_compiled_as_a_whole_when_python_calls_it_and_gives_the_same_result(
+    chain: tuple[Any, Any, Any],
+) -> None:
     third, sixth, difference = chain
     numbers = np.random.default_rng(1).normal(size=100)
     differences = [difference(x) for x in numbers]

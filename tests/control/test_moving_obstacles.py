@@ -95,7 +95,7 @@ def test_arms_beside_a_slow_hand_follow_nearly_as_accurately_as_without_a_hand(c
     assert beside < 1.5 * free + 1e-3
 
 
-def test_if_no_more_reports_on_an_obstacle_come_the_arms_come_to_rest_and_the_report_names_the_pair(
+def test_when_reports_on_an_obstacle_end_the_arms_come_to_rest_and_the_controller_names_the_pair(
     controller: CartesianController,
 ) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
@@ -128,14 +128,14 @@ def test_if_a_hand_is_no_longer_reported_an_arm_moves_only_where_the_hand_cannot
     assert 0.5 < moved < 1.3
 
 
-def test_a_report_has_its_age_at_receipt_plus_the_time_of_all_ticks_even_very_long_ticks(
+def test_the_age_of_a_report_is_its_age_at_receipt_plus_the_durations_of_all_ticks_even_very_long_ticks(
     controller: CartesianController,
 ) -> None:
     at = controller.tool_pose("left").translation + np.array([0.0, 0.6, 0.0])
     controller.move_obstacle("hand", hand(at, speed=0.2, age=0.5))
     assert controller.obstacle_reports["hand"].age == 0.5
     controller.step({}, 0.002)
-    controller.step({}, 0.3)  # The arms move for a tenth of a second only, but all 0.3 s pass.
+    controller.step({}, 0.3)  # The arms move for only 0.1 s, but the report gets 0.3 s older.
     assert controller.obstacle_reports["hand"].age == pytest.approx(0.802)
     controller.brake(0.05)
     assert controller.obstacle_reports["hand"].age == pytest.approx(0.852)
@@ -220,7 +220,7 @@ def test_if_a_hand_is_too_near_to_an_arm_this_arm_can_only_move_away_and_the_oth
     assert np.linalg.norm(controller.tool_pose("left").translation - away["left"].translation) < 5e-3
 
 
-def test_the_values_slower_and_rise_of_an_obstacle_follow_from_its_speeds_and_its_acceleration() -> None:
+def test_the_values_slower_and_rise_of_an_obstacle_are_computed_from_its_speeds_and_its_acceleration() -> None:
     made = hand(np.zeros(3), 1.0, acceleration=2.0, speed_now=0.2)
     assert (made.slower, made.rise) == pytest.approx((0.8, 0.4))
     assert hand(np.zeros(3), 1.0, acceleration=2.0).slower == 0.0

@@ -154,7 +154,7 @@ def test_fingers_exactly_at_their_kept_distance_can_move_away_again(robot: Robot
     assert np.linalg.norm(near.controller.tool_pose("left").translation - ABOVE.translation) < 1e-3
 
 
-COAL = 2e-6  # Largest difference between our distances and those of Coal [m].
+COAL = 2e-6  # Largest difference between our distances and Coal's distances [m].
 
 
 class Cell(Driven):
@@ -220,7 +220,7 @@ def test_a_narrower_interval_of_openings_is_refused_if_its_capsule_would_be_too_
     assert pair is not None
     assert "table_0" in pair
     assert cell.controller.openings["left"] == wide
-    # The capsules for openings from 0.3 to 0.4 lie within those for the wider interval.
+    # The capsules for openings from 0.3 to 0.4 lie within the capsules for the wider interval.
     assert cell.set_opening("left", 0.3, 0.4) is None
     assert cell.spare_of_bodies() >= -COAL
     assert cell.set_opening("left", *wide) is None

@@ -1,4 +1,4 @@
-"""DAQP finds the minimum of the soft problem, and is called only if the minimum of the cost alone breaks a bound."""
+"""DAQP finds the minimum of the soft problem. It is called only if the minimum of the cost alone violates a bound."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class BothWays:
 
 
 def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
-    """Return a target at the time ``t`` [s] that moves in small circles, slowly into the other arm and out again."""
+    """Return a target at the time ``t`` [s]. It moves in small loops, and slowly into the other arm and out again."""
     by = np.array([0.08 * np.sin(4.0 * t), -side * 0.25 * (1.0 - np.cos(t)), 0.04 * np.sin(3.0 * t)])
     return pin.SE3(home.rotation, home.translation + by)
 

@@ -24,8 +24,8 @@ from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, 
 from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
-# Duration of a run [s], and that of a run with long ticks. Long ticks need more time, because the tests compare shares
-# of ticks.
+# Durations [s] of a run and of a run with long ticks, and the duration of a long tick [s]. Runs with long ticks last
+# longer, so that they have enough ticks: the test bounds the fraction of ticks with a fallback.
 DURATION, DURATION_OF_LONG_TICKS, LONG_TICK = 1.2, 2.0, 0.01
 # A faulty solver fails in the last part of every period [s]. FAULT_SHARE is this part's fraction of the period.
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
@@ -173,7 +173,8 @@ def test_the_contract_holds_at_every_tick_of_every_hostile_motion(name: str, rob
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # An absurd solution is followed as far as it is certified. Later, rows may act too late to prevent a fallback.
+    # An absurd solution is followed as far as it is certified. In the ticks after it, the rows of the QP may act too
+    # late to prevent a fallback, although the solver works again.
     assert unfounded <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses

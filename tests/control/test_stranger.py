@@ -32,7 +32,7 @@ class Slowly:
 
 
 class NotBackwards:
-    """A constraint that the left tool does not move backwards along the world's x axis."""
+    """A constraint with which the left tool does not move backwards along the world's x axis."""
 
     hard = True
 

@@ -29,7 +29,7 @@ def _taken(tracker: TargetTracker) -> TaskTargets:
 
 
 def _update(tracker: TargetTracker, targets: dict[str, Any], dt: float, q: Array, v: Array) -> tuple[str, ...]:
-    """Return the names whose target is not usable, including unknown names."""
+    """Give the tracker new targets. Return the names whose target is not usable, including unknown names."""
     known = tracker.offer(targets)
     return () if update_targets(_taken(tracker), q, v, dt) and known else tracker.rejected(targets)
 

@@ -26,7 +26,7 @@ def robot_of(free: bool) -> Robot:
 
 @cache
 def figures_of(name: str, free: bool = False) -> MotionFigures:
-    """Return the figures of our controller in a work motion. With ``free``, no pair is monitored."""
+    """Run a work motion with our controller, and return the measured figures. If ``free``, no pair is monitored."""
     robot = robot_of(free)
     return run_motion(OwnController(robot, CONFIG), robot, WORK_MOTIONS[name])
 

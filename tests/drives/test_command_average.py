@@ -150,7 +150,7 @@ def test_a_whole_run_keeps_the_jerk_limit_in_every_tick(mode: CommandMode) -> No
     assert np.abs(np.diff(q, n=3, axis=0) / H**3).max() > 0.5 * jerk
 
 
-def test_in_torque_mode_pairs_keep_no_additional_distance_because_of_a_jerk_limit() -> None:
+def test_in_torque_mode_a_jerk_limit_does_not_increase_the_distances_that_pairs_keep() -> None:
     loop = Pipeline.from_config(limited(5000.0), input=HandsInput(), plant="mujoco", mode="torque")
     plain = Pipeline.from_config(limited(None), input=HandsInput(), plant="mujoco", mode="torque")
     assert (loop.controller.kept_distances == plain.controller.kept_distances).all()

@@ -113,7 +113,7 @@ def press(hand: str, t: float) -> HandInputs:
 def record_step(folder: Path, duration: float = DURATION) -> Run:
     """Record a run with both arms engaged and a step of the hands.
 
-    The positions of the plant's joints always equal those of the reference one tick earlier.
+    The positions of the plant's joints always equal the positions of the reference one tick earlier.
     """
     loop = pipeline(source=PlayedInput(step_of_the_hand, press, {side: EvenSampling(100.0) for side in SIDES}))
     watch = Watch(loop)

@@ -51,7 +51,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
 
 
 def read_as_replay_buffer(folder: Path) -> tuple[dict[str, Any], list[int]]:
-    """Return the arrays and the ends of episodes, with the checks of diffusion_policy's ReplayBuffer."""
+    """Check a store as diffusion_policy's ReplayBuffer does. Return its arrays, and the ends of its episodes."""
     assert (folder / ".zgroup").exists(), "its version of zarr reads the second layout only"
     root = zarr.open(str(folder), mode="r")
     ends = root["meta"]["episode_ends"][:]

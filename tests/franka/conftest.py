@@ -1,4 +1,4 @@
-"""Import the plug-in from its folder. The parts that need no robot are then tested even if it is not installed."""
+"""Import the plug-in from its folder, so that its parts that need no robot are tested even if it is not installed."""
 
 from __future__ import annotations
 

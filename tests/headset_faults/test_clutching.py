@@ -20,14 +20,14 @@ pytestmark = pytest.mark.slow
 
 # Displacement of the frame by an alignment, or of the hands during a pause.
 ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.4, 0.0, 0.0]))
-STILL = 5e-4  # Largest motion of a tool that counts as none [m].
+STILL = 5e-4  # A tool that moves by less than this counts as resting [m].
 again_and_again = pytest.mark.parametrize("times", [10, pytest.param(100, marks=pytest.mark.soak)])
 
 
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
     """Align by the left hand's chord. The frame moves ``samples`` samples after the buttons are pressed.
 
-    The frame moves by the share ``shift`` of ``ANEW``.
+    The frame moves by the fraction ``shift`` of ``ANEW``.
     """
     op.lower.add("left")
     op.upper.add("left")

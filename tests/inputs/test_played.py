@@ -1,4 +1,4 @@
-"""The errors of a headset are added to exact poses: noise and uneven times, and other errors only if wanted."""
+"""Errors of a headset are added to exact poses: noise and uneven times, and on request also tremor and dropouts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def measured(sampling: SampleTiming, count: int) -> tuple[Array, Array]:
     return np.array(times), np.array(added)
 
 
-def test_even_samples_are_exact_and_received_without_delay() -> None:
+def test_evenly_spaced_samples_are_exact_and_received_without_delay() -> None:
     times, added = measured(EvenSampling(50.0), 101)
     np.testing.assert_allclose(times, 0.02 * np.arange(101), rtol=1e-15)
     np.testing.assert_allclose(added, 0.0, atol=1e-12)

@@ -182,7 +182,9 @@ def test_if_a_policy_returns_none_the_fault_of_its_actions_says_so() -> None:
 
 
 @pytest.mark.parametrize("error", [SystemExit(3), GeneratorExit()], ids=repr)
-def test_if_a_policy_raises_an_exit_this_is_a_fault_and_the_policy_is_called_again(error: BaseException) -> None:
+def test_if_a_policy_raises_systemexit_or_generatorexit_this_is_a_fault_and_the_policy_is_called_again(
+    error: BaseException,
+) -> None:
     def leaves(observation: Observation) -> Array:
         raise error
 

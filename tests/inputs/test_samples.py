@@ -128,7 +128,7 @@ def test_a_pose_that_stays_equal_to_the_last_bit_is_frozen_whatever_its_stamp() 
     assert faults(handed_on(TwoHands(rest, 1, (0.0, 0.0), tremor=False, noise=1e-7).samples(2.0))) == set()
 
 
-def test_a_hand_that_keys_move_does_not_count_as_frozen_if_it_rests_without_noise() -> None:
+def test_a_hand_that_is_moved_with_keys_does_not_count_as_frozen_if_it_rests_without_noise() -> None:
     (_, _, pose), *_ = resting()
     watch = HandsWatch()
     virtual = Reception("q2r_left_hand_pose", "left", pose, virtual=True)

@@ -134,7 +134,7 @@ class TestArms:
         assert found.position_error_mm_p99 == pytest.approx(30.0)
         assert found.rotation_error_deg_rms == 0.0
 
-    def test_only_time_in_which_the_leash_drags_counts_as_leashed_and_a_new_anchor_keeps_the_earlier_slip(self) -> None:
+    def test_only_time_in_which_the_slip_grows_counts_as_leashed_and_slips_of_all_engagements_are_added(self) -> None:
         slip = np.zeros((2000, 2))
         slip[500:1000, 0] = np.linspace(0.0, 0.2, 500)
         slip[1000:1500, 0], slip[1900:, 0] = 0.2, 0.05
@@ -182,7 +182,7 @@ class TestTiming:
         assert found.lost_share == pytest.approx(100 / 2100)
         assert found.longest_lost_s == pytest.approx(0.2)
 
-    def test_ticks_that_came_late_but_on_their_grid_are_not_missed(self) -> None:
+    def test_ticks_that_are_late_by_less_than_a_period_do_not_count_as_missed(self) -> None:
         dt = np.tile((1.6 * DT, 0.4 * DT), 1000)
         assert timing_figures(episode(dt=dt, t=np.cumsum(dt))).missed_ticks == 0
 

@@ -129,7 +129,7 @@ def trained(exported: Path) -> Path:
 
 
 def default_interrupt() -> None:
-    """Restore the default action of Ctrl-C. A shell lets its background jobs ignore it, and Python inherits that."""
+    """Restore the default action of Ctrl-C. Background jobs of a shell ignore Ctrl-C, and Python inherits this."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

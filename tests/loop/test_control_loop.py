@@ -44,7 +44,7 @@ class Arms:
         return self.loop.step(self.state, {"left": target}, self.now, DT, {"left": 1.0}, {})
 
 
-def test_arms_of_another_program_get_commands_after_they_have_rested_and_none_after_a_stop() -> None:
+def test_if_another_program_owns_the_plant_commands_start_when_the_arms_have_rested_and_end_at_a_stop() -> None:
     arms = Arms(owns_plant=False)
     assert arms.tick().command is None
     while arms.loop.supervisor.phase is not Phase.ACTIVE:
@@ -57,7 +57,7 @@ def test_arms_of_another_program_get_commands_after_they_have_rested_and_none_af
     assert step.command is None
 
 
-def test_the_loops_own_plant_gets_commands_while_the_arms_are_stopped() -> None:
+def test_if_the_loop_owns_the_plant_the_plant_gets_commands_while_the_arms_are_stopped() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     arms.loop.supervisor.stop(Reason(RosReason.STOP_SERVICE))
@@ -91,7 +91,7 @@ def test_joint_states_that_are_not_finite_are_not_trusted() -> None:
     assert not step.trusted
 
 
-def test_arms_that_lost_their_session_brake_from_measured_states_until_a_state_jumps() -> None:
+def test_after_the_end_of_a_fri_session_states_are_trusted_until_a_state_jumps() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(FriReason.FRI_DROPPED, arm="left"))
@@ -112,7 +112,7 @@ def test_arms_that_lost_their_session_brake_from_measured_states_until_a_state_j
         pytest.param((0.0, 0.6), 0.9, 0.9, id="less closed to that one"),
     ],
 )
-def test_while_the_arms_rest_a_gripper_that_did_not_get_its_wanted_opening_may_only_move_back(
+def test_while_arms_rest_a_gripper_that_was_not_allowed_its_wanted_opening_may_move_only_back(
     before: tuple[float, float] | None, wanted: float, granted: float
 ) -> None:
     assert without_proof(wanted, before) == granted
@@ -153,7 +153,7 @@ def test_the_time_before_a_late_first_tick_makes_a_hands_report_older() -> None:
     assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5
 
 
-def test_the_age_of_a_hands_report_grows_while_arms_of_another_program_are_not_commanded() -> None:
+def test_the_age_of_a_hands_report_grows_while_the_plant_of_another_program_gets_no_commands() -> None:
     arms = ReportedHand(owns_plant=False)
     first = arms.now + DT
     for _ in range(500):

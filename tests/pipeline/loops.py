@@ -55,7 +55,7 @@ def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
 
 
 class FreezingClock(LoopClock):
-    """Simulated time in which the loop sometimes stands still."""
+    """A clock of simulated time, in which the loop stands still before a tick if ``freeze`` is greater than 0."""
 
     freeze = 0.0  # Duration of the standstill before the next tick [s].
 

@@ -18,7 +18,7 @@ _LATE = 0.0005  # Largest delay of messages [s].
 
 
 class WeighedArm(StillArm):
-    """An arm whose measured torques are those of a robot with a load. The client does not know this load."""
+    """An arm that measures the torques of a robot with a load. The client does not know this load."""
 
     def __init__(self, robot: Robot, arm: str) -> None:
         self._robot, self._joints, self._data = robot, robot.arms[arm].joints, robot.model.createData()
@@ -43,7 +43,7 @@ class StuckArm(WeighedArm):
 
 
 class PendantCabinets(VirtualCabinets):
-    """Virtual cabinets whose overlays start as soon as they are ready, unless they are ``locked``."""
+    """Virtual cabinets that allow commands (KUKA's overlay) as soon as they are ready, unless they are ``locked``."""
 
     locked = False
 
@@ -63,8 +63,8 @@ def slow_run(
 ) -> SlowRun:
     """Return a slow run of ``config`` behind virtual cabinets.
 
-    The arms have the type ``arm`` and the masses of ``truth``. ``prepare`` gets the cabinets before the run.
-    ``listener`` gets each tick's moment.
+    The virtual arms have the type ``arm`` and the masses of the robot ``truth``. ``prepare`` gets the cabinets before
+    the run. ``listener`` gets the :class:`Moment` of each tick.
     """
 
     def plant(robot: Robot, slow: Config) -> PendantCabinets:

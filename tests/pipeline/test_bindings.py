@@ -84,7 +84,7 @@ def test_after_a_stop_presses_engage_no_arm_and_undoing_the_stop_moves_no_arm() 
 
 
 @pytest.mark.slow
-def test_a_program_may_send_the_arms_home_too() -> None:
+def test_a_program_can_also_start_homing() -> None:
     loop = pipeline(PlayingHands())
     watch = Watch(loop)
     loop.listeners.append(lambda tick: loop.go_home() if 1.5 <= tick.t < 1.502 else None)
@@ -108,7 +108,7 @@ def wandering(t: float) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
-def test_carried_tools_keep_their_relative_pose_while_one_hand_moves_and_turns_both_tools(plant: str) -> None:
+def test_with_the_action_carry_one_hand_moves_and_turns_both_tools_and_their_relative_pose_stays(plant: str) -> None:
     hands = PlayingHands((0.35, "press_middle"), left=wandering)
     ticks = watched(hands, 5.0, plant, grip="carry").ticks
     carried = [tick for tick in ticks if tick.states["right"] == "carried"]
@@ -116,7 +116,7 @@ def test_carried_tools_keep_their_relative_pose_while_one_hand_moves_and_turns_b
     assert carried[-1].t > 4.9
     wanted = carried[0].tools["left"].actInv(carried[0].tools["right"])
     for tick in carried:
-        assert not tick.reference.report.binding  # The motion meets no limit.
+        assert not tick.reference.report.binding  # No limit affects the motion.
         relation = tick.tools["left"].actInv(tick.tools["right"])
         assert np.linalg.norm(relation.translation - wanted.translation) < 0.001
         assert np.degrees(np.linalg.norm(pin.log3(relation.rotation.T @ wanted.rotation))) < 0.5

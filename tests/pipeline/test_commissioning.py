@@ -39,7 +39,7 @@ def test_one_joint_moves_by_a_degree_and_back_while_all_others_rest(config: Conf
 
 
 @pytest.mark.slow
-def test_a_joint_that_does_not_move_is_named(config: Config) -> None:
+def test_the_error_about_a_joint_that_does_not_move_names_the_joint(config: Config) -> None:
     with slow_run(config, StuckArm) as run, pytest.raises(PlantError, match=r"left_A1: commanded .* measured 0\.00"):
         measure_joint(run, 0)
 
@@ -61,7 +61,7 @@ def test_it_is_an_error_if_a_joint_does_not_follow_or_if_other_joints_move_with_
 
 
 @pytest.mark.slow
-def test_if_a_hand_lets_go_its_arm_stops_within_the_certified_stop_plus_the_latency(config: Config) -> None:
+def test_if_a_hand_releases_its_arm_the_arm_stops_within_the_certified_stop_plus_the_latency(config: Config) -> None:
     with slow_run(config) as run:
         report = measure_stop(run, "left")
     assert report.tool_speed_mm_s == pytest.approx(30.0, abs=1.0)
@@ -70,9 +70,9 @@ def test_if_a_hand_lets_go_its_arm_stops_within_the_certified_stop_plus_the_late
 
 
 def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
-    """Return the moments of a motion of the left arm's A2 at 0.1 rad/s.
+    """Return a :class:`Moment` for each tick of a motion of the left arm's joint A2 at 0.1 rad/s.
 
-    The arm follows its hand for one second, and then moves on for ``on`` [s].
+    The arm follows its hand for one second. After its release, the arm moves on for ``on`` [s].
     """
     v = np.zeros(robot.model.nv)
     v[1] = 0.1

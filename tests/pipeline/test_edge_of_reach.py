@@ -19,17 +19,18 @@ from tests.support.processes import Watch, cell
 
 SECONDS, RATE = 37.0, 72.0  # Duration [s], and rate of the hands [Hz].
 LET_THROUGH = 1.0  # Time between two delays of the network [s].
-# Delays of the network [s]. In six of seven delays, ten samples wait. The seventh is longer than the gate's timeout.
+# Delays of the network [s]. In six of seven delays, ten samples wait. The seventh delay is so long that the input's
+# gate times out.
 HELD_UP = 0.13, 0.165
 FROM, BEYOND = -0.15, 0.15  # Range of the targets relative to the edge of reach [m].
 # Longest time in which a target may move while its tool does not, for example where the target reverses [s].
 STALL = 0.16
-SLOW, STEP = 0.05, 9.0  # Speeds between these belong to a moving target. A faster target has jumped [m/s].
+SLOW, STEP = 0.05, 9.0  # A target moves if its speed is between these. A faster target has jumped [m/s].
 _WAITS = 0.4  # An operator whose arm does not follow presses after this time [s].
 
 
 class Bursts(SampleTiming):
-    """Samples at an even rate. All samples that wait during a delay of the network arrive together at its end."""
+    """Samples are taken at a constant rate. All samples that wait during a network delay arrive together at its end."""
 
     def __init__(self) -> None:
         self._t = 0.0

@@ -63,7 +63,7 @@ class TestStop:
         assert speed(watch.ticks[-1]) < 1e-3
         assert summary.at_rest
 
-    def test_a_stop_request_before_a_run_ends_this_run_at_once_and_does_not_end_the_next_run(self) -> None:
+    def test_a_run_that_a_program_stops_before_its_start_ends_at_once_and_the_next_run_is_not_affected(self) -> None:
         loop = pipeline()
         loop.stop()
         assert loop.run(10.0, realtime=False).ticks == 1
@@ -71,7 +71,7 @@ class TestStop:
 
 
 def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
-    """Assert that the run ended at rest, without input after the stop. The contract was checked at every tick."""
+    """Assert that the arms braked to rest in time before the run ended, and got no input while they braked."""
     stopping = [tick for tick in watch.ticks if STOPPING in tick.states.values()]
     assert stopping[0] is watch.ticks[-len(stopping)]
     assert all(not tick.samples and not any(tick.engaged.values()) for tick in stopping)

@@ -120,7 +120,7 @@ def test_a_new_run_does_not_compensate_the_weight_of_an_object_that_was_held_in_
 
 
 class LeftUpperPresses(ScriptedInput):
-    """The left hand presses its upper button at 1.0 s and once more, and moves in between."""
+    """The left hand presses its upper button at 1.0 s, moves, and presses the button again at the time ``again``."""
 
     again = 1.6  # Time of the second press [s].
 
@@ -133,7 +133,7 @@ class LeftUpperPresses(ScriptedInput):
 
 
 @pytest.mark.slow
-def test_if_the_limiter_keeps_a_gripper_from_closing_the_gripper_counts_as_holding_no_object(
+def test_a_gripper_that_is_not_allowed_to_close_fully_does_not_count_as_holding_an_object(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})

@@ -36,7 +36,7 @@ def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: C
     with waiting_cabinets(Robot.from_config(config), config) as cabinets:
         reports = measure_kill(config, lambda: np.concatenate([cabinets[arm].arm.q for arm in SIDES]), led=0.3)
     for report in reports:
-        assert set(cabinets[report.arm].trips) <= {Trip.LATE}  # A cabinet without its client ends the session.
+        assert set(cabinets[report.arm].trips) <= {Trip.LATE}  # A cabinet whose client is killed ends the session.
         assert 0.0 < report.stopped_mm < report.allowed_mm
 
 

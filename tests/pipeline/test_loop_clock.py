@@ -71,9 +71,9 @@ def test_simulated_time_takes_no_real_time_and_is_never_late() -> None:
 
 
 def paced_run(monkeypatch: pytest.MonkeyPatch, ticks: int, busy_s: float) -> tuple[LoopClock, float]:
-    """Take ``ticks`` of a paced clock, each of which keeps the computer busy for ``busy_s``.
+    """Run a loop for ``ticks`` ticks with a paced clock. Each tick keeps the computer busy for ``busy_s``.
 
-    Return the clock, and the time that the ticks took [s].
+    Return the clock, and the real time that the ticks took [s].
     """
     computer = LateSleeper([])
     monkeypatch.setattr(loop_clock, "time", computer)

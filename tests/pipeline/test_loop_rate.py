@@ -1,4 +1,7 @@
-"""Loops adapt to the computer. Its clock may pace simulated time. A loop in real time gets a rate that it can keep."""
+"""Loops adapt to the speed of the computer.
+
+Paced simulated time is at most as fast as real time. A loop in real time gets a rate that it can keep.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +77,7 @@ def test_a_paced_run_equals_an_unpaced_run_to_the_bit_also_on_a_slow_computer() 
         (0.0030, 250.0, "loop rate 250 Hz, the lowest: 99 of 100 ticks take at most 3000 us, 75 %"),
     ],
 )
-def test_the_highest_rate_with_time_to_spare_is_chosen_and_printed(
+def test_the_highest_rate_at_which_the_computer_has_time_left_in_each_tick_is_chosen_and_printed(
     tick_s: float, rate: float, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Pipeline, "_resting_ticks", lambda self: repeat(tick_s))
@@ -110,7 +113,7 @@ def test_no_ticks_are_measured_if_the_cell_has_a_rate_or_if_the_time_is_simulate
     assert summary.ticks == pytest.approx(101, abs=2), "1000 Hz"
 
 
-def test_a_loop_that_falls_behind_prints_one_line_that_names_the_cures(
+def test_a_loop_that_falls_behind_prints_one_line_that_says_what_would_help(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(pipeline_module.LoopClock, "falls_behind", lambda self: True)
@@ -120,7 +123,7 @@ def test_a_loop_that_falls_behind_prints_one_line_that_names_the_cures(
         assert cure in line
 
 
-def test_if_a_loop_falls_behind_a_measured_rate_the_line_says_that_the_rate_was_chosen_at_the_start(
+def test_if_a_loop_with_a_measured_rate_falls_behind_the_line_says_that_the_rate_was_chosen_at_the_start(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Pipeline, "_resting_ticks", lambda self: iter([1e-5] * 1000))

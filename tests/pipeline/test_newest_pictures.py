@@ -40,7 +40,7 @@ def front(path: Path, **changes: object) -> CameraConfig:
 
 
 class Seeing:
-    """A policy that holds the arms and notes the pictures of its camera."""
+    """A policy that holds the arms, and stores the number and the capture time of each picture of its camera."""
 
     rate = 50.0
 
@@ -114,7 +114,7 @@ def test_in_simulated_time_the_time_of_a_picture_is_a_time_of_the_loops_clock(tm
 
 
 class Reading(Seeing):
-    """A policy that notes why a picture cannot be read."""
+    """A policy that stores the message of the error if a picture cannot be read."""
 
     why = ""
 

@@ -20,7 +20,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class FeltHands(HandsInput):
-    """An input that keeps what the hands feel, with the time of the tick."""
+    """An input that stores the vibrations that the hands feel, with the time of the tick."""
 
     def __init__(self, **paths: Path) -> None:
         super().__init__(**paths)

@@ -24,7 +24,7 @@ from tests.support.processes import Watch, assert_torque_bounds, cell, changes, 
 
 
 class Counting:
-    """A constraint that holds left_A3, a cost of zero and a solver, which all count their calls."""
+    """Counts its calls. It is a constraint that holds left_A3, a task with a cost of zero, and a solver."""
 
     hard = True
 
@@ -229,7 +229,7 @@ class HostileInput(ScriptedInput):
 
 
 @pytest.mark.slow
-def test_five_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing() -> None:
+def test_in_five_thousand_ticks_with_hostile_samples_no_limit_is_exceeded_and_no_exception_is_raised() -> None:
     loop = pipeline(HostileInput(7))
     watch = Watch(loop)
     summary = loop.run(10.0, realtime=False)

@@ -115,7 +115,7 @@ def test_the_input_in_docs_extending_engages_in_a_real_time_run_too(file: Path) 
     ],
     ids=["input", "cannot be imported", "plant", "binding", "binding by name"],
 )
-def test_the_command_check_prints_one_line_about_a_missing_plugin_or_control_and_the_pipeline_raises_it(
+def test_the_command_check_prints_one_line_about_a_missing_plugin_or_control_and_the_pipeline_raises_an_error(
     file: Path, change: dict[str, Any], told: str
 ) -> None:
     checked = q2r2("check", str(changed(file, change)))

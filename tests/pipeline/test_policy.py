@@ -46,7 +46,10 @@ class Circle:
 
 
 class Operator(HandsInput):
-    """An operator who presses the lower buttons to take over, and again to give back. The hands always move."""
+    """An operator who presses the lower buttons to take the arms over, and again to give them back to the policy.
+
+    The hands always move.
+    """
 
     def poll(self, now: float) -> list[HandSample]:
         hand = super().poll(now)
@@ -91,7 +94,7 @@ def test_no_target_jumps_at_a_takeover_and_every_tick_says_who_acted() -> None:
         assert summary.arms[arm].policy_s == pytest.approx(states.count("policy") * 0.002)
 
 
-def test_a_recording_says_at_every_frame_who_acted_and_is_replayed_to_the_bit(tmp_path: Path) -> None:
+def test_a_recording_says_at_every_frame_who_acted_and_its_replay_is_equal_to_the_bit(tmp_path: Path) -> None:
     loop, tags = with_operator(), []
     loop.listeners.append(lambda tick: tags.append([tick.interventions[arm] for arm in SIDES]))
     file = file_of(record(tmp_path, loop, 3.0 * CYCLE))

@@ -1,4 +1,4 @@
-"""Arms that move slowly: their speed, their rest, and the ends of a motion."""
+"""Runs in which the arms move slowly: how fast they are, how they come to rest, and what ends a motion early."""
 
 from __future__ import annotations
 

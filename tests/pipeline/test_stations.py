@@ -24,7 +24,10 @@ def listed() -> list[tuple[str, ...]]:
 
 @cache
 def calls_of_a_tick_with_samples() -> dict[str, int]:
-    """Return the place of the first call of each function in a tick that receives samples, by qualified name."""
+    """Return the qualified names of all functions that are called in a tick that receives samples.
+
+    The value of each name is the number of functions whose first calls came earlier.
+    """
     pipeline = pipeline_of({"loop_rate_hz": 500.0, "cameras": {}}, ScriptedInput("circle"), "kinematic", "position")
     pipeline.begin()
     pipeline.tick_until(pipeline.tick().now + FOLLOWS)

@@ -41,7 +41,7 @@ def test_the_first_target_and_a_resting_target_are_unchanged() -> None:
     assert led.translation[0] == 0.4
 
 
-def test_a_motion_that_stops_suddenly_overshoots_only_for_a_moment() -> None:
+def test_the_target_of_a_motion_that_stops_suddenly_overshoots_for_only_a_short_time() -> None:
     lead, end = TargetLead(), 0.3 * 99 * DT
     for k in range(100):
         followed(lead, 0.3 * k * DT)

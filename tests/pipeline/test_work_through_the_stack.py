@@ -20,13 +20,13 @@ SLIDE = replace(WORK_MOTIONS["slide"], rest=1.5)
 
 
 def work(motion: WorkMotion, mode: str, seed: int | None = 0) -> Any:
-    """Do ``motion`` in ``mode`` with every promise checked at every tick, and return complete StackFigures."""
+    """Run ``motion`` in ``mode``, and check every promise at every tick. Return the :class:`StackFigures`."""
     config = load_config("config/dual_iiwa7.yaml").model_copy(update={"loop_rate_hz": RATE})
     return Stack(config, mode).run(motion, seed)
 
 
 def assert_safe(done: Any) -> None:
-    """Assert that every promise is kept without pause or slip, with distances and torques within limits."""
+    """Assert that promises, distances and torque limits are kept, no arm pauses, and no target slips."""
     assert (done.broken, done.pauses, done.stopped, done.slip_mm) == ({}, [], None, 0.0)
     assert done.fallback_percent == 0.0
     assert done.measured_margin_mm > 0.0

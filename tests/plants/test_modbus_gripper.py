@@ -134,7 +134,7 @@ def test_a_gripper_is_reset_at_the_first_command_if_only_a_reset_ends_its_fault(
     assert simulated.written == [*begins, (9, 0, 0, 255, 255, 128)]
 
 
-def test_fingers_that_an_object_stops_are_measured_at_that_opening(
+def test_if_an_object_stops_the_fingers_their_opening_at_the_object_is_measured(
     connect: Connect, simulated: SimulatedGripper
 ) -> None:
     simulated.object_at = 204

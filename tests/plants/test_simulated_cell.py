@@ -19,7 +19,7 @@ def cell(robot: Robot, config: Config) -> SimulatedCell:
 
 
 def push(cell: SimulatedCell, now: float) -> None:
-    """Command torques that bear the arms and turn one joint."""
+    """Command torques that hold the arms against gravity and turn one joint."""
     robot = cell.robot
     tau = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), cell.plant.state().q)
     tau[5] += 5.0
@@ -86,7 +86,7 @@ def test_the_cell_follows_a_motion_whose_commands_come_unevenly(with_velocity: b
             assert np.abs(follower.q - motion(now)[0]).max() < (0.001 if with_velocity else 0.4 * period + 0.001)
 
 
-def test_without_commands_the_cell_coasts_briefly_and_brakes() -> None:
+def test_without_commands_the_cell_keeps_its_last_velocity_for_a_short_time_and_then_brakes() -> None:
     follower = JointFollower(np.zeros(2), ACCELERATION, LIMIT)
     v = np.array([1.0, -2.0])
     for tick in range(100):

@@ -27,7 +27,7 @@ def prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Non
     return put
 
 
-def test_a_card_that_forwards_every_message_at_once_needs_no_note(prints: Callable[..., None]) -> None:
+def test_there_is_no_note_about_a_card_that_forwards_every_message_at_once(prints: Callable[..., None]) -> None:
     prints()
     assert card_notes("lo") == []
 

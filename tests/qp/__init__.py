@@ -1,1 +1,1 @@
-"""Offline tests of the QP under limits with every solver that is installed: ``pytest tests/qp`` runs all of them."""
+"""Tests of the QP and its limits with every installed solver, without a robot. ``pytest tests/qp`` runs all of them."""

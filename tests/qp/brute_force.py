@@ -26,7 +26,7 @@ _ROUNDING = 1e-9
 def cost_of(problem: QpProblem, v: Array) -> float:
     """Return the cost f, which the module's docstring defines, at velocities ``v`` (nv,) [rad/s].
 
-    Hard rows have no part in this cost.
+    Hard rows are not part of this cost.
     """
     soft = len(problem.rows_lower) - problem.hard
     slack = np.maximum(problem.rows_lower - problem.rows @ v, 0.0)[:soft]

@@ -16,7 +16,8 @@ ROBOT = cell("dual_iiwa7").robot
 # DAQP, with which the other solvers are compared, comes first. Names are sorted so that all test processes agree.
 NAMES = (*OURS, *sorted(set(qpsolvers.available_solvers) - set(OURS)))
 
-# By default, these two solvers stop at a residual. For a nearly stretched arm, whose cost is flat, this is inaccurate.
+# By default, these two solvers stop when a residual is small. For a nearly stretched arm, the cost is nearly flat, so
+# that a small residual does not make the solution accurate.
 EXACTLY: dict[str, dict[str, float]] = {
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0},
     "scs": {"eps_abs": 1e-9, "eps_rel": 1e-9},

@@ -24,7 +24,7 @@ REST, RESTED = 1e-3, 0.02  # Arms rest if all joints are slower than this [rad/s
 TRACKING = 1.05  # Largest tracking error with another solver, as a multiple of the error with DAQP.
 ROUNDING = 1e-9
 MOTIONS = {name: case for name, case in CASES.items() if case.fault is None}
-SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # These motions run with the other short tests.
+SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # With DAQP and OSQP, these motions are not marked as slow.
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ def test_limits_and_distances_hold_at_every_tick_as_checked_with_simple_arithmet
 
 
 @pytest.mark.parametrize("solver", each_solver())
-def test_joints_that_are_driven_towards_their_limits_reach_each_limit_and_break_no_limit(solver: str) -> None:
+def test_joints_that_are_driven_towards_their_limits_reach_each_limit_and_exceed_no_limit(solver: str) -> None:
     controller, last = controller_with(solver), [arm.joints[-1] for arm in ROBOT.arms.values()]
     limits, q = limits_of(controller), ROBOT.home.copy()
     q[last] = limits.upper[last] - 1.2

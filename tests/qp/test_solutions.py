@@ -1,4 +1,7 @@
-"""The QP has one solution. Every solver finds that of brute force in small problems, and that of DAQP in motions."""
+"""The QP has one solution.
+
+In small problems, every solver finds the solution that brute force finds. In motions, it finds the solution of DAQP.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,7 @@ def _at_hardly_any_cost(random: np.random.Generator) -> QpProblem:
 
 
 def corners() -> dict[str, QpProblem]:
-    """Return problems in which a usual part is missing, contradicts another part, or leaves no choice."""
+    """Return special problems, for example without rows, with contradictory rows, or with only one allowed velocity."""
     random = np.random.default_rng(11)
     return {
         "no rows": small(random, [], []),
@@ -129,7 +132,7 @@ class Noting:
 
     def solve(self, problem: QpProblem) -> QpSolution:
         if problem.minimum is None:
-            self.problems.append(problem)  # The problem is a copy already, because every solver but ours gets copies.
+            self.problems.append(problem)  # The problem is already a copy, because this solver is not ours.
         return self._solver.solve(problem)
 
 

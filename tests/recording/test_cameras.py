@@ -62,7 +62,7 @@ def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_peri
     places = [plant.model.joint(name).qposadr[0] for name in loop.robot.joint_names]
 
     def observe(tick: Tick) -> None:
-        """Keep the tick's time, and check that the joint positions for pictures are those of the tick's state."""
+        """Store the tick's time. Check that the joint positions for pictures are the positions in the tick's state."""
         np.testing.assert_array_equal(plant.observed_qpos[places], tick.state.q)
         times.append(tick.t)
 

@@ -42,7 +42,9 @@ def test_the_joint_with_the_lowest_jerk_limit_decides_the_window(robot: Robot) -
         (300.0, r"control\.jerk_limit = 300: allowed for left_A. with its acceleration limit: 400 rad/s\^3 or more"),
     ],
 )
-def test_a_jerk_limit_that_does_not_fit_the_robot_is_refused_by_name(robot: Robot, jerk: object, why: str) -> None:
+def test_the_error_about_a_jerk_limit_that_does_not_fit_the_robot_says_what_is_allowed(
+    robot: Robot, jerk: object, why: str
+) -> None:
     with pytest.raises(ConfigError, match=why):
         kept_distances(robot, ControllerSettings(jerk_limit=jerk))
 

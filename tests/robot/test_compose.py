@@ -110,14 +110,14 @@ def test_an_invalid_arm_raises_an_error_of_one_line_with_the_key_and_what_is_all
     assert "\n" not in str(error.value)
 
 
-def test_one_error_names_all_joints_of_a_home_in_degrees() -> None:
+def test_one_error_names_all_joints_whose_home_position_is_given_in_degrees() -> None:
     with pytest.raises(ConfigError) as error:
         compose(one_arm(home=[0, 20, 0, -90, 0, 60, 0]))
     named = [fault.partition(" allows")[0] for fault in error.value.faults]
     assert named == [f"arms.left.home[{at}] = {q}: joint A{at + 1}" for at, q in ((1, 20), (3, -90), (5, 60))]
 
 
-def test_one_error_names_all_resting_joints_outside_their_limits() -> None:
+def test_one_error_names_all_joints_of_robot_home_that_are_outside_their_limits() -> None:
     home = {"torso_lift_joint": 2.0, "head_1_joint": 90.0}
     cell = load_config("config/tiago_dual.yaml")
     assert cell.robot is not None

@@ -61,7 +61,7 @@ def test_an_invalid_description_raises_an_error_of_one_line(old: str, new: str, 
     assert "\n" not in str(error.value)
 
 
-def test_two_links_that_carry_each_other_outside_the_tree_of_links_are_refused() -> None:
+def test_a_loop_of_two_links_beside_the_tree_of_links_is_refused() -> None:
     loop = "".join(f'<link name="{a}"/>' for a in "ab") + "".join(
         f'<joint name="{a}{b}" type="fixed"><parent link="{a}"/><child link="{b}"/></joint>' for a, b in ("ab", "ba")
     )

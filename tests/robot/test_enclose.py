@@ -128,7 +128,7 @@ def test_capsules_spheres_and_fixed_boxes_are_not_changed() -> None:
         assert geometry.geometryObjects[0].geometry == shape
 
 
-def test_an_unbounded_shape_is_refused_by_name() -> None:
+def test_the_error_about_an_unbounded_shape_names_the_shape_and_its_kind() -> None:
     with pytest.raises(RobotError, match="thing_0 is a Halfspace"):
         enclose_shapes(_one(coal.Halfspace(np.array([0.0, 0, 1]), 0.0), 0))
 
@@ -238,7 +238,7 @@ def test_impossible_numbers_of_capsules_are_refused(capsules: dict[str, int], sa
 
 def test_the_capsule_of_a_round_mesh_is_found_without_an_array_of_all_pairs_of_points() -> None:
     points = np.random.default_rng(0).normal(size=(3000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)  # All points are corners.
+    points /= np.linalg.norm(points, axis=1, keepdims=True)  # All points are corners of their convex hull.
     tracemalloc.start()
     try:
         radius, _, _ = enclosing_capsule(points)

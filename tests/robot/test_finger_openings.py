@@ -67,7 +67,7 @@ def finger_at(robot: Robot, joint: str, position: float, points: Array) -> Array
 
 def test_the_body_of_the_hand_e_contains_both_fingers_at_each_opening_of_the_interval() -> None:
     robot = Robot.from_config(HAND_E)
-    # Both ends of a capsule around a fingertip in robots/hand_e.urdf, by finger, in the frame of the finger's link.
+    # For each finger, both ends of a capsule around its tip in robots/hand_e.urdf, in the frame of its link [m].
     drawn = {1: np.array([[0.00825, 0.0, 0.03725], [0.00825, 0.012, 0.03725]])}
     drawn[2] = drawn[1] * [1.0, -1.0, 1.0]
     name = "left_hand_e_finger_1_envelope_3"

@@ -82,7 +82,7 @@ def test_a_fixed_joint_follows_no_other_joint() -> None:
         ),
     ],
 )
-def test_an_impossible_mimic_is_refused_by_name(joints: tuple[str, ...], complaint: str) -> None:
+def test_the_error_about_an_impossible_mimic_names_the_joint(joints: tuple[str, ...], complaint: str) -> None:
     with pytest.raises(RobotError, match=re.escape(complaint)) as error:
         parse_urdf(model(*joints), "arm.urdf")
     assert str(error.value).startswith("arm.urdf: joint")
@@ -131,7 +131,7 @@ ARM = (joint("j1", limit="-2 2"), *(joint(f"j{n}", limit="-2 2", parent=f"j{n - 
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """Return an arm of three joints, and a hand whose fingertip follows a joint that follows the driven one."""
+    """Return an arm of three joints with a hand. Its joint tip follows joint middle, which follows joint finger."""
     file = tmp_path_factory.mktemp("hand") / "arm.urdf"
     file.write_text(model(*ARM, *HAND))
     gripper = {"joints": ["finger"], "open_position": 0.5, "closed_position": 0.0}

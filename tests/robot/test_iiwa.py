@@ -91,7 +91,7 @@ def test_a7_turns_the_flange_about_its_own_axis(robot: Robot) -> None:
     np.testing.assert_allclose(pose.rotation, pin.utils.rotate("z", math.pi / 6), atol=1e-9)
 
 
-def test_the_masses_of_links_equal_those_of_the_source(name: str) -> None:
+def test_the_masses_of_links_equal_the_masses_in_the_source(name: str) -> None:
     urdf = load_description(name).urdf
     written = [float(mass.get("value", "nan")) for mass in urdf.findall("link/inertial/mass")]
     assert written == list(SHEETS[name].masses)
@@ -99,14 +99,14 @@ def test_the_masses_of_links_equal_those_of_the_source(name: str) -> None:
     np.testing.assert_allclose([inertia.mass for inertia in model.inertias][1:], written[1:])
 
 
-def test_the_inertias_of_links_are_those_of_physically_possible_bodies(robot: Robot) -> None:
+def test_the_inertias_of_links_are_physically_possible(robot: Robot) -> None:
     for inertia in list(robot.model.inertias)[1:]:
         principal = np.linalg.eigvalsh(inertia.inertia)
         assert principal[0] > 0
         assert principal[0] + principal[1] > principal[2]
 
 
-def test_the_limits_of_joints_equal_those_of_the_data_sheet_and_never_exceed_them(robot: Robot, name: str) -> None:
+def test_the_limits_of_joints_equal_the_limits_in_the_data_sheet_and_never_exceed_them(robot: Robot, name: str) -> None:
     position = np.radians([170, 120, 170, 120, 170, 120, 175])
     for actual, sheet in (
         (robot.position_upper, position),
@@ -138,7 +138,7 @@ def test_the_model_has_the_rotor_inertias_and_gear_ratios_of_the_data_sheet(robo
         ("iiwa14", 6, (0, 0.0697, -0.017), (0, 0.0707, 0.021), 0.0793),
     ],
 )
-def test_a_capsule_has_the_ends_that_enclose_the_mesh_and_is_at_most_1_5_mm_thicker_than_needed(
+def test_a_capsule_has_the_ends_for_its_mesh_and_its_radius_exceeds_the_needed_radius_by_at_most_1_5_mm(
     model: str, link: int, start: tuple[float, ...], end: tuple[float, ...], radius: float
 ) -> None:
     full = pin.buildModelFromXML(urdf := compose(one_arm(model=model)).urdf)

@@ -1,4 +1,4 @@
-"""Each pair keeps the distance for its names, otherwise that for the class of its bodies, otherwise min_distance."""
+"""A pair keeps the distance for its names, otherwise the distance for its class of bodies, otherwise min_distance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BY_CLASS = {
 
 
 def kept(robot: Robot, **settings: Any) -> dict[frozenset[str], float]:
-    """Return the distances by pair of links."""
+    """Return the kept distance of each pair of links [m]."""
     found = kept_distances(robot, ControllerSettings.model_validate(settings))
     pairs = robot.distances(robot.home)
     return {
@@ -76,7 +76,7 @@ def test_a_hand_in_its_arms_model_is_a_tool_and_the_links_that_its_gripper_moves
     assert frozenset(("left_panda_leftfinger", "table")) in found
 
 
-def test_a_named_pair_keeps_its_own_distance_instead_of_that_of_its_class(dual_iiwa: Robot) -> None:
+def test_a_named_pair_keeps_its_own_distance_instead_of_the_distance_of_its_class(dual_iiwa: Robot) -> None:
     named = [
         {"pair": ["table", "left_*"], "distance": 0.05},
         {"pair": ["left_link_?", "table"], "distance": 0.06},

@@ -68,7 +68,7 @@ def read(file: Path) -> tuple[ET.Element, pin.Model, pin.GeometryModel]:
     return urdf, model, pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
 
 
-def test_links_shapes_and_gravity_torques_equal_those_of_mujoco_in_random_postures(arm: Path) -> None:
+def test_links_shapes_and_gravity_torques_equal_the_results_of_mujoco_in_random_postures(arm: Path) -> None:
     urdf, model, geometry = read(arm)
     theirs = mujoco.MjModel.from_xml_path(str(arm))
     assert LinkTree(urdf, "arm").root == "base", "what moves freely and the floor are no part of it"
@@ -123,7 +123,9 @@ def test_the_limits_of_joints_come_from_the_file_but_their_velocity_limits_come_
     assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
 
 
-def test_a_capsule_stays_a_capsule_and_a_drawing_is_a_collision_shape_only_if_a_body_has_no_other(arm: Path) -> None:
+def test_a_capsule_stays_a_capsule_and_a_visual_geom_becomes_a_collision_shape_only_if_a_body_has_no_other(
+    arm: Path,
+) -> None:
     urdf, _, geometry = read(arm)
     shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
     assert isinstance(shapes["shoulder"], coal.Capsule)

@@ -34,7 +34,7 @@ def made(
     return robot, [record.getMessage() for record in caplog.records]
 
 
-def test_two_links_that_block_their_own_arm_are_named_with_lines_that_let_the_arm_move(
+def test_the_warning_names_two_links_that_block_their_own_arm_and_contains_settings_with_which_it_moves(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, (said,) = made(ur5, caplog)
@@ -72,7 +72,7 @@ def test_the_warning_contains_python_code_that_prevents_the_warning(
         ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
     ],
 )
-def test_two_needed_changes_are_named_if_pairs_are_too_near_at_home_and_other_links_hardly_part(
+def test_the_warning_names_two_changes_if_pairs_are_too_near_at_home_and_others_are_near_in_all_postures(
     model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file = load_description(f"example-robot-data:{model}").file
@@ -107,7 +107,7 @@ def test_if_other_postures_bring_a_pair_apart_the_warning_about_it_proposes_anot
     assert "base_link and forearm_link overlap, and are not watched, though they can part" in said
 
 
-def test_the_refusal_of_a_start_contains_the_lines_that_the_cell_needs(
+def test_the_error_that_refuses_a_start_contains_the_lines_that_the_file_of_the_cell_needs(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, _ = made(ur5, caplog)

@@ -56,7 +56,7 @@ def test_within_an_arm_exactly_the_pairs_of_links_that_can_meet_are_monitored(du
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_the_floor_is_monitored_against_exactly_the_links_that_can_come_near_it(dual_iiwa: Robot, side: str) -> None:
-    """Two links cannot come near it: link 1 turns only about the vertical, and link 2 is too short."""
+    """Two links cannot come near the floor: link 1 turns only about the vertical, and link 2 is too short."""
     reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope", f"{side}_{FINGERS}"}
     with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
     assert with_floor == reach_it

@@ -17,7 +17,7 @@ TOOLS = {"left": "left_tool_frame", "right": "right_tool_frame"}
 
 
 def _urdf(links: int = 3, limit: str = 'lower="-1" upper="1" velocity="1" effort="1"', kind: str = "revolute") -> str:
-    """Return a chain of links 0.3 m apart, each with a sphere of 0.1 m."""
+    """Return a chain of links 0.3 m apart, each with a sphere whose radius is 0.1 m."""
     ball = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
     return '<robot name="chain"><link name="l0"/>' + "".join(
         f'<link name="l{n}">{ball}</link><joint name="j{n}" type="{kind}"><parent link="l{n - 1}"/>'

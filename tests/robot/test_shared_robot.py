@@ -62,7 +62,7 @@ TIAGO: dict[str, Any] = {
 def _tiago_pairs() -> str:
     """Return an SRDF with pairs that the maker does not list.
 
-    The capsules of forearm and palm overlap, and so do those of torso and shoulder.
+    The capsules of forearm and palm overlap, and the capsules of torso and shoulder overlap too.
     """
     hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
     pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]
@@ -117,7 +117,7 @@ def test_a_robot_without_an_srdf_monitors_every_pair_that_some_posture_brings_ap
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_the_dynamics_of_a_robot_equal_those_of_the_whole_model_with_locked_joints(
+def test_the_dynamics_of_a_robot_equal_the_dynamics_of_the_whole_model_with_locked_joints(
     name: str, request: pytest.FixtureRequest
 ) -> None:
     robot: Robot = request.getfixturevalue(name)

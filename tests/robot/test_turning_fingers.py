@@ -180,7 +180,9 @@ def test_a_capsule_is_inside_another_capsule_if_the_balls_at_both_of_its_ends_ar
     assert sticks_out(inside._replace(radius=np.array([0.016])), outer).all()
 
 
-def test_bodies_that_are_computed_together_equal_single_bodies_within_the_sampling_error(hand: Hand) -> None:
+def test_bodies_that_are_computed_together_equal_bodies_computed_one_by_one_within_the_sampling_error(
+    hand: Hand,
+) -> None:
     _, _, bodies = hand
     together = TurningSweeps(list(bodies.values())).capsules((0.1, 0.4))
     for row, body in enumerate(bodies.values()):

@@ -69,7 +69,7 @@ def test_a_pause_in_the_reports_of_one_joint_does_not_affect_other_joints(robot:
 
 
 @pytest.mark.parametrize(("reported", "held"), [(-3.1, -3.08), (-3.1, 3.12), (3.12, -3.1)])
-def test_the_held_angle_is_given_in_the_turn_that_is_nearest_to_the_measured_angle(
+def test_the_angle_that_the_drives_hold_is_given_in_the_turn_that_is_nearest_to_the_measured_angle(
     robot: Any, reported: float, held: float
 ) -> None:
     counter, zero = TurnCounter(robot), np.zeros(3)

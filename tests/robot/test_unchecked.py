@@ -1,4 +1,4 @@
-"""Links of an arm that would keep no distance are refused by name, unless ``unchecked_links`` names them."""
+"""An arm is refused if some of its links would keep no distance, unless ``unchecked_links`` names these links."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def arm(third: str = BALL, last: str = BALL) -> str:
         pytest.param(arm(DRAWN), "l3: is drawn and has no collision shape", id="drawn, of a mass that is not said"),
     ],
 )
-def test_a_heavy_or_drawn_link_without_a_shape_is_refused_unless_unchecked_links_names_the_link(
+def test_a_heavy_or_visible_link_without_a_collision_shape_is_refused_unless_unchecked_links_names_it(
     urdf: str, fault: str
 ) -> None:
     with pytest.raises(RobotError, match=re.escape(fault)) as error:
@@ -85,7 +85,7 @@ def test_a_link_that_no_arm_moves_needs_no_shape() -> None:
     assert Robot.from_urdf(base, {"left": "l5"}).unchecked_links == ()
 
 
-def test_a_base_that_is_drawn_without_a_shape_is_named_in_a_note_until_the_user_decides() -> None:
+def test_unchecked_notes_name_a_visible_base_without_a_collision_shape_until_the_user_decides() -> None:
     urdf = arm().replace('<link name="l0"/>', f'<link name="l0">{weighs(0.0001)}{DRAWN}</link>')
     robot = Robot.from_urdf(urdf, {"left": "l5"})
     assert unchecked_faults(robot) == []
@@ -96,7 +96,7 @@ def test_a_base_that_is_drawn_without_a_shape_is_named_in_a_note_until_the_user_
     assert list(unchecked_notes(named)) == ["unchecked_links: nothing keeps l0 off anything"]
 
 
-def test_a_named_base_with_a_shape_is_still_monitored_and_a_note_says_so() -> None:
+def test_a_base_that_is_named_but_has_a_shape_is_still_monitored_and_unchecked_notes_say_so() -> None:
     urdf = arm().replace('<link name="l0"/>', f'<link name="l0">{BALL}</link>')
     robot = Robot.from_urdf(urdf, {"left": "l5"}, unchecked_links=["l0"])
     assert list(unchecked_notes(robot)) == [
@@ -137,13 +137,13 @@ def test_names_of_missing_links_in_unchecked_links_are_refused(given: object, co
 
 
 def z1(**keys: object) -> Config:
-    """Return a cell of Unitree's Z1, in whose model two heavy links are drawn and have no collision shape."""
+    """Return a cell of Unitree's Z1, in whose model two heavy links have visual geometry and no collision shape."""
     model = str(load_description("example-robot-data:z1").file)
     made = one_arm(model=model, tip="gripperStator", home=[0.0, 1.0, -0.5, 0.0, 0.0, 0.0])
     return Config.model_validate(made.model_dump() | keys)
 
 
-def test_a_cell_can_name_links_without_shapes_or_enclose_their_drawings() -> None:
+def test_a_cell_can_name_links_without_collision_shapes_or_enclose_their_visual_geometry() -> None:
     assert [fault.partition(":")[0] for fault in unchecked_faults(Robot.from_config(z1()))] == [
         "left_link01",
         "left_link05",
@@ -161,7 +161,7 @@ def test_a_cell_can_name_links_without_shapes_or_enclose_their_drawings() -> Non
     assert "left_link01" not in watched
 
 
-def test_programs_that_move_arms_refuse_links_without_shapes_with_the_faults_that_check_names() -> None:
+def test_programs_that_move_arms_refuse_links_without_shapes_with_the_faults_of_unchecked_faults() -> None:
     lines = "; ".join(unchecked_faults(Robot.from_config(z1())))
     with pytest.raises(RobotError, match=re.escape(f"{z1().name}: {lines}")):
         Pipeline.from_config(z1(), input="scripted", plant="kinematic")
@@ -169,7 +169,7 @@ def test_programs_that_move_arms_refuse_links_without_shapes_with_the_faults_tha
         SlowRun(z1(), KinematicPlant)
 
 
-def test_a_named_link_with_a_shape_is_still_monitored_and_a_note_says_so() -> None:
+def test_a_link_that_is_named_but_has_a_shape_is_still_monitored_and_unchecked_notes_say_so() -> None:
     robot = Robot.from_urdf(arm(), {"left": "l5"}, unchecked_links=["l3"])
     assert list(unchecked_notes(robot)) == [
         "unchecked_links: watched all the same, since they have collision shapes: l3"

@@ -47,7 +47,7 @@ def test_an_invalid_or_contradictory_quaternion_is_refused(origin: str) -> None:
         arm(origin=origin)
 
 
-def test_elements_of_xacro_are_refused_by_name_since_readers_skip_them() -> None:
+def test_the_error_about_xacro_elements_names_these_elements_because_urdf_readers_would_skip_them() -> None:
     text = ARM.format(**USUAL).replace("</robot>", "<xacro:hand xmlns:xacro='http://ros.org/wiki/xacro'/></robot>")
     with pytest.raises(RobotError, match=r"xacro:hand.*allowed.*\.xacro"):
         parse_urdf(text, "arm.urdf")
@@ -76,14 +76,14 @@ def test_an_empty_inertial_counts_as_no_inertial() -> None:
         ({"speed": "180"}, "degrees"),
     ],
 )
-def test_suspicious_limits_are_reported_with_their_joint(parts: dict[str, str], said: str) -> None:
+def test_a_note_on_suspicious_limits_names_their_joint(parts: dict[str, str], said: str) -> None:
     (note,) = notes_on(ET.fromstring(ARM.format(**(USUAL | parts))))
     assert note.text.startswith("turn ")
     assert said in note.text
 
 
 @pytest.mark.parametrize("safety", ["", "<safety_controller k_velocity='1'/>"])
-def test_usual_limits_need_no_note(safety: str) -> None:
+def test_there_are_no_notes_on_usual_limits(safety: str) -> None:
     assert notes_on(ET.fromstring(ARM.format(**(USUAL | {"safety": safety})))) == []
 
 
@@ -106,7 +106,7 @@ def test_collision_meshes_in_millimetres_are_scaled_to_metres(tmp_path: Path) ->
     assert [float(part) for part in mesh.get("scale", "").split()] == pytest.approx([2e-3, 1e-3, 1e-3])
 
 
-def test_a_drawing_in_millimetres_that_becomes_a_shape_is_scaled_to_metres(tmp_path: Path) -> None:
+def test_a_visual_mesh_in_millimetres_that_becomes_a_collision_shape_is_scaled_to_metres(tmp_path: Path) -> None:
     (tmp_path / "hand.dae").write_text(COLLADA)
     drawn = f'<link name="hand"><visual><geometry><mesh filename="{tmp_path}/hand.dae"/></geometry></visual></link>'
     link = ET.fromstring(drawn)

@@ -27,7 +27,7 @@ _PROCESSES = pytest.StashKey[Processes]()
 
 
 def need_ros() -> None:
-    """Skip a module without ROS, and fail if only ``q2r2 ros build-interfaces`` has not been run."""
+    """Skip a module if there is no ROS. Fail if there is ROS, but ``q2r2 ros build-interfaces`` has not been run."""
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     if absent := [package.name for package in interface_packages() if importlib.util.find_spec(package.name) is None]:
         if missing := missing_tools(Path(sys.prefix)):
@@ -122,7 +122,7 @@ def context(domain: int) -> Iterator[Any]:
 
 @contextmanager
 def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
-    """Return a context manager that makes a spinning node, for fixtures that outlive one test."""
+    """Return a context manager that makes a spinning node, for fixtures that last longer than one test."""
     import rclpy
     from rclpy.action import ActionServer
     from rclpy.exceptions import InvalidHandle
@@ -150,7 +150,7 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
         executor.shutdown()
         thread.join()
         for server in [one for one in made.waitables if isinstance(one, ActionServer)]:
-            server.destroy()  # The server outlives its node, and would serve the next test on this domain.
+            server.destroy()  # The server would go on after its node is destroyed, and answer the next test.
         made.destroy_node()
         context.try_shutdown()
 

@@ -44,7 +44,7 @@ class LbrSoak:
         self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # The newest command: session, tick, q, v.
         self._late = 0  # The last tick that was late.
         self._brakings = 0  # Number of brakings so far.
-        self._disturbed = 0.0  # Time until which an end may not be noticed yet [s].
+        self._disturbed = 0.0  # Until this time, the end of a session may still be unnoticed [s].
         self.virtual.on_command = self._on_command
         robot, node = self.virtual.robot, self.virtual.node
         self._fastest = robot.velocity_limit * node._controller.settings.velocity_scale * (1.0 + _NEAR)

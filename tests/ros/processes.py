@@ -116,7 +116,7 @@ class Processes:
         self.started: list[RosProcess] = []
 
     def start(self, *command: str, name: str = "", **environment: str) -> RosProcess:
-        """Start a program; ``environment`` is added to that of the private domain."""
+        """Start a program; ``environment`` is added to the environment of the private domain."""
         log = self._folder / f"{len(self.started)}-{name or Path(command[0]).name}.log"
         given = {"cwd": ROOT, "env": self._environment | environment, "stdin": subprocess.DEVNULL}
         with log.open("w") as output:

@@ -49,7 +49,7 @@ def test_packages_of_a_sourced_install_are_kept_and_a_package_built_beside_it_is
     venv.create(bare_environment := tmp_path / "bare", symlinks=True, with_pip=False)
     python, prefix = bare_environment / "bin" / "python", Path(sys.prefix)
     libraries = [prefix / "lib", *(prefix / SITE_PACKAGES).glob("ros_*.libs")]
-    sourced = {  # These variables are those of a sourced ROS install.
+    sourced = {  # A sourced ROS install sets these variables.
         "AMENT_PREFIX_PATH": str(prefix),
         "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *filter(None, sys.path)])),
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
@@ -123,7 +123,7 @@ def test_the_error_of_a_failed_build_names_the_log(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-# The fields and their order are those of docs.ros.org/en/jazzy/p/control_msgs. A type hash depends only on the names
+# The fields and their order are taken from docs.ros.org/en/jazzy/p/control_msgs. A type hash depends only on the names
 # and types of fields.
 GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
 PUBLISHED_FIELDS = {

@@ -1,4 +1,4 @@
-"""If another program commands the arms, or a receiver stands still, both arms stop and the culprit is named."""
+"""If another program commands the arms, or a receiver stands still, both arms stop. The fault names its cause."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     assert {driven.state(f"{arm}_state") for arm in driven.robot.arms} == {"stopped"}
     driven.end_streams()
 
-    # The second publisher is silent: after a reset, the controller commands beside it and listens.
+    # The second publisher is silent now. After a reset, the controller commands again, and still listens to the topic.
     assert driven.call("/cartesian_controller/reset").success
     wait_until(lambda: driven.state("phase") == "active", "it is active again", lambda: driven.states)
     driven.engage("left", "right")

@@ -211,7 +211,7 @@ def test_states_of_several_publishers_on_one_topic_are_merged_by_joint_and_a_mis
     q += 0.1
     send(5, 14)
     np.testing.assert_allclose(taken[-1].q, [*(q[:5] - 0.1), *q[5:]])
-    assert taken[-1].stamp == taken[-2].stamp  # The oldest part is that of the first publisher.
+    assert taken[-1].stamp == taken[-2].stamp  # The oldest part comes from the first publisher.
     send(0, 5)
     assert taken[-1].stamp > taken[-2].stamp
     node.destroy_node()

@@ -49,7 +49,7 @@ def test_no_guard_trips_and_no_command_jumps_however_the_sessions_end(release: s
     assert soak.moved > 1.0
 
 
-def test_if_a_session_begins_while_the_arms_still_brake_it_gets_no_command_of_the_stop(domain: int) -> None:
+def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the_stop(domain: int) -> None:
     with virtual_lbrs("for Jazzy", domain) as virtual:
         Operator(virtual)
         left, supervisor = virtual.drivers["left"], virtual.node._supervisor

@@ -1,4 +1,4 @@
-"""Properties of all nodes: reports, ticks, ends, and discovery with the user's settings."""
+"""Properties of all nodes: how they report, tick and end, and how they are discovered with the user's settings."""
 
 from __future__ import annotations
 
@@ -316,7 +316,7 @@ def test_the_executor_answers_services_and_runs_coroutines(ticking: Ticking, exe
 
 
 @pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick", "a slow timer"])
-def test_a_timer_that_another_one_destroys_does_not_run(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
+def test_a_timer_that_another_timer_destroys_does_not_run(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
     timers: list[Any] = []
 
     def run() -> None:

@@ -1,4 +1,4 @@
-"""Moving obstacles as markers: the valid ones, and one line about each invalid one."""
+"""Markers of moving obstacles: a valid marker becomes an obstacle, and an invalid marker causes one line."""
 
 from __future__ import annotations
 

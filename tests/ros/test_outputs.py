@@ -55,7 +55,7 @@ class Stream:
         self.published = self.left_out = 0
 
     def run(self, seconds: float, fault: Callable[[], Reason | None] | None = None) -> Reason | None:
-        """Publish for ``seconds``, or until ``fault`` returns a reason; by default, that the listener is silent.
+        """Publish for ``seconds``, or until ``fault`` returns a reason. By default, the reason is a silent listener.
 
         Return this reason, or None.
         """
@@ -119,7 +119,7 @@ def test_a_new_receiver_of_positions_is_a_fault_only_while_arms_are_off_their_re
 def test_arms_with_separate_command_topics_get_only_their_own_joints_on_their_topic(
     node: Any, robot: Robot, context: Any
 ) -> None:
-    # The right arm's topic comes from the pattern for all arms, and the left one's from its own setting.
+    # The right arm's topic comes from the pattern for all arms, and the left arm's topic from its own setting.
     given = ("output_topic:=/{arm}/commands", "left.output_topic:=/left/commands")
     sender = BaseNode("sender", context=context, cli_args=as_arguments(*given))
     output = make_output("trajectory", sender, robot, load_config(CONFIG), 0.004)
@@ -258,7 +258,7 @@ def test_a_listener_that_ended_before_the_stream_began_is_not_reported(
     listener.wait()
     publisher.begin()
     assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
-    assert publisher.listeners == 1  # The graph still lists it.
+    assert publisher.listeners == 1  # The graph still lists the listener.
 
 
 def test_an_endpoint_keeps_the_name_of_its_node_after_the_graph_has_lost_this_name() -> None:

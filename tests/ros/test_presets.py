@@ -167,7 +167,7 @@ def test_a_controller_gets_targets_that_keep_its_rules_in_both_modes(
         move((0.0, 0.0, 0.06))
         os.kill(theirs.process.pid, signal.SIGKILL)
         theirs.process.wait()
-        rigs.move((0.1, 0.0, 0.0), 0.3)  # The restarted controller must not get targets that catch up with it.
+        rigs.move((0.1, 0.0, 0.0), 0.3)  # The restarted controller must not get targets of this motion.
         rigs.wait_for_pause()
         joints.wait_for_rest()
         with joints.tools_rest(STILL, "its controller is restarted"):

@@ -155,7 +155,7 @@ def test_presses_and_services_begin_and_end_the_same_episodes(node: Any, process
     felt(rig, EPISODE_ENDS)
     refused = call(node, "/recorder/stop")
     assert not refused.success
-    felt(rig, EPISODE_REJECTED)  # This vibration hides a weaker one, such as that of a discard.
+    felt(rig, EPISODE_REJECTED)  # This vibration hides weaker ones, such as the vibration for a discard.
     squeeze(rig)
     recorder.wait("episode_open", True)
     assert call(node, "/recorder/discard").success
@@ -197,7 +197,7 @@ def felt(rig: ArmRig, pulse: Pulse) -> None:
 
 @pytest.mark.alone
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
-    """A kill costs the messages that the node has not passed on, and those of the chunk that is not written."""
+    """A kill loses the messages that the node has not passed on, and the messages of the chunk that is not written."""
     record_poses(recorder, node, 100)
     folder, (writer,) = recorder.folder, children(recorder.process.pid)
     os.kill(writer, signal.SIGSTOP)

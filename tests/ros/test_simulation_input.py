@@ -115,7 +115,7 @@ def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any
     arm["engaged"] = True
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.02, "the hand moves")
-    arm |= {"engaged": False, "ready": False}  # A fault stops it at once, and it is not ready for a moment.
+    arm |= {"engaged": False, "ready": False}  # A fault stops the arm, which is then not ready for a moment.
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
     drained(left["inputs"])
     time.sleep(0.5)
@@ -124,7 +124,7 @@ def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any
     wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
     arm["engaged"] = True
     time.sleep(7.0)
-    arm["engaged"] = False  # From now on, only a person can engage it.
+    arm["engaged"] = False  # From now on, only a person can engage the arm.
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.0)

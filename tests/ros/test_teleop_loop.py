@@ -28,7 +28,7 @@ from q2r2_control.teleop.teleop import Teleop
 
 
 class WayHome:
-    """The client of the services for the way home, and a teleop layer. The test plays the controller."""
+    """The client of the services for homing, and a teleop layer. The test takes the role of the controller."""
 
     def __init__(self) -> None:
         self.teleop = Teleop(TeleopSettings(), ["left", "right"])
@@ -37,7 +37,7 @@ class WayHome:
         self._client: Any = HomeClient(node, "/c")
 
     def update(self, now: float, goes: bool, outcome: Reason | None = None) -> list[str]:
-        """Update the client at ``now`` [s]; ``goes``: whether the controller reports that it goes home.
+        """Update the client at ``now`` [s]. If ``goes`` is True, the controller reports that the arms go home.
 
         Return the events, each as the new state of an arm and the reason.
         """

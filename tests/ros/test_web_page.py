@@ -88,12 +88,12 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
         page.wait_until(lambda: all("the pause service" in why for why in page.row("why")))
         page.press("Bring both")
         page.wait_until(lambda: page.row("state") == ["homing", "homing"])
-        page.press("Pause both")  # The pause also ends the way home.
+        page.press("Pause both")  # The pause also ends homing.
         page.wait_until(lambda: "homing" not in page.row("state"))
         page.press("Stop")
         page.wait_until(lambda: all("the stop service" in why for why in page.row("why")))
         page.press("Bring both")
-        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # It is refused with a reason.
+        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # Homing is refused with a reason.
         page.press("Take a stop back")
         page.wait_until(lambda: all("waits for its operator" in why for why in page.row("why")))
         assert "engaged" not in page.row("state")

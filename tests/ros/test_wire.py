@@ -1,4 +1,4 @@
-"""Messages that are written and read as bytes equal those of rclpy and rosbags."""
+"""Messages that are written and read as bytes equal the messages of rclpy and rosbags."""
 
 from __future__ import annotations
 

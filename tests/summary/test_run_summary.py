@@ -68,7 +68,7 @@ def test_the_largest_slip_of_an_engagement_is_reported(statistics: RunStatistics
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
 
 
-def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair_that_held_it(
+def test_the_time_for_which_a_gripper_was_not_allowed_to_move_is_reported_with_the_last_pair_that_caused_it(
     statistics: RunStatistics,
 ) -> None:
     for held in ({"left": ("left_finger", "table")}, {"left": ("left_finger", "right_link_5")}, {}):
@@ -140,7 +140,7 @@ def test_the_summary_has_the_worst_ratios_and_margin_of_all_ticks_relative_to_th
 
 def test_an_acceleration_is_compared_with_the_limit_of_its_own_joint(statistics: RunStatistics) -> None:
     a = np.zeros(14)
-    a[[0, 8]] = 3.0, -2.72  # The joints are A1 of the left arm and A2 of the right one, whose limit is lower.
+    a[[0, 8]] = 3.0, -2.72  # The joints are the left A1 and the right A2, whose limit is lower.
     add(statistics, a=a)
     assert statistics.summary(1.0).max_acceleration_ratio == pytest.approx(2.72 / 5.44)
 
@@ -207,7 +207,7 @@ def test_an_unmeasured_distance_is_not_reported(summary: TorqueSummary) -> None:
 
 
 @pytest.mark.parametrize("size", [1, 2, 99, 5000])
-def test_percentiles_equal_those_of_numpy_to_a_thousandth_of_the_unit(size: int) -> None:
+def test_percentiles_equal_the_percentiles_of_numpy_to_a_thousandth_of_the_unit(size: int) -> None:
     values = np.random.default_rng(size).exponential(3e-4, size)
     histogram = Histogram(1e-3)
     for value in values:

@@ -1,4 +1,4 @@
-"""The shipped cell for tests of the reasons that stop its arms."""
+"""The shipped cell, for tests of the supervision that stops its arms."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def test_if_lags_differ_since_the_first_tick_the_arms_are_stopped_after_a_tenth_
     assert found == [False, False, True]
 
 
-def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_has_caught_up(
+def test_both_arms_brake_while_one_arm_is_behind_and_go_on_when_it_has_caught_up(
     robot: Robot, controller: CartesianController
 ) -> None:
     world = World(robot, controller)

@@ -51,7 +51,7 @@ def swing(robot: Robot, angle: float) -> list[Array]:
 
 @pytest.fixture(scope="module")
 def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """Return the cell with a post that the measured left elbow meets in its swing. The reference's elbow does not."""
+    """Return the cell with a post. The measured left elbow meets the post in its swing. The reference stays away."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])
     elbow = data.oMi[robot.model.getJointId("left_A4")].translation

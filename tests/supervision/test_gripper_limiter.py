@@ -98,7 +98,9 @@ def test_a_gripper_opens_as_far_as_is_proven_safe_and_tries_every_5_ms_to_open_f
     assert not gripper.limiter.held
 
 
-def test_without_a_measurement_a_gripper_gets_its_commands_and_its_fingers_count_at_all_openings(gripper: Cell) -> None:
+def test_without_a_measurement_a_gripper_gets_its_commands_and_its_fingers_are_monitored_at_all_openings(
+    gripper: Cell,
+) -> None:
     for wanted in (1.0, 0.0, 0.5):
         gripper.tick(wanted, {})
         assert gripper.granted == {"left": wanted, "right": 1.0}
@@ -202,7 +204,9 @@ def test_turning_fingers_close_only_as_far_as_the_table_allows_and_go_on_when_th
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_a_closed_gripper_does_not_count_as_held_if_its_interval_of_openings_may_not_shrink(gripper: Cell) -> None:
+def test_a_closed_gripper_is_not_reported_as_limited_if_its_interval_of_openings_is_not_allowed_to_shrink(
+    gripper: Cell,
+) -> None:
     controller = gripper.controller
     gripper.run(0.0, 0.05)
     with patch.object(controller, "set_opening", return_value=("finger", "table")):

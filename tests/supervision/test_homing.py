@@ -134,7 +134,9 @@ def test_homing_can_be_interrupted_and_the_arms_then_come_to_rest_at_once(
     assert np.abs(world.state.q - at).max() < 0.04
 
 
-def test_if_its_caller_ends_homing_the_outcome_is_interrupted(robot: Robot, controller: CartesianController) -> None:
+def test_if_the_caller_ends_homing_early_the_outcome_is_that_homing_was_interrupted(
+    robot: Robot, controller: CartesianController
+) -> None:
     world = World(robot, controller, robot.home + 0.05)
     homing = world.supervisor.homing
     assert world.supervisor.go_home() is None
@@ -154,7 +156,7 @@ def test_while_no_path_home_is_known_the_arms_rest_and_a_tick_examines_at_most_t
         at = homing.step(q, np.zeros_like(q), DT).joints
         assert at is not None
         assert np.array_equal(at, q)
-        assert distances.call_count - before <= 3  # One call measures the distances at the start; two examine postures.
+        assert distances.call_count - before <= 3  # One call measures the start, and two calls examine postures.
         ticks += 1
     assert homing.outcome is CommonReason.HOMING_NO_WAY
     assert ticks > 100
@@ -170,7 +172,9 @@ def test_homing_ends_if_only_the_straight_path_is_allowed_and_this_path_is_not_f
     assert homing.outcome is CommonReason.HOMING_NO_WAY
 
 
-def test_if_an_arm_cannot_move_homing_waits_for_it_and_then_ends_with_this_reason(robot: Robot) -> None:
+def test_if_an_arm_cannot_move_homing_waits_for_it_and_then_ends_with_the_reason_homing_held_up(
+    robot: Robot,
+) -> None:
     settings = load_config(CONFIG).control
     homing = JointHoming(robot, lambda: (robot.distance_values, kept_distances(robot, settings).values), robot.home)
     q = robot.home.copy()
@@ -198,7 +202,7 @@ def test_if_the_tools_do_not_reach_home_homing_ends_five_seconds_after_they_were
 ) -> None:
     home = robot.tool_pose(robot.home, "left")
     homing, zero, outcomes = ToolHoming({"left": home}, lambda _arm: home * away), np.zeros_like(robot.home), []
-    for dt in (1.9, 0.2, 4.8, 0.2):  # The target takes 2 s.
+    for dt in (1.9, 0.2, 4.8, 0.2):  # The target needs 2 s to move home.
         target = homing.step(robot.home, zero, dt).targets["left"]
         assert target is not None
         outcomes.append((target.isApprox(home, 1e-9), homing.outcome))

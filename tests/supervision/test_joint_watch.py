@@ -1,4 +1,4 @@
-"""Joint states are a fault if they are late, old or not finite, or if they jump. Other controllers may lag farther."""
+"""Joint states are a fault if they are late, old or not finite, or jump. Arms of other controllers may lag farther."""
 
 from __future__ import annotations
 

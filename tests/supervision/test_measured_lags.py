@@ -42,12 +42,12 @@ def test_resting_or_reversing_arms_with_the_same_lag_get_nearly_the_same_lag(rob
 
 
 def test_the_largest_lag_that_is_found_is_0_4_s(robot: Robot) -> None:
-    """If an arm is farther behind than that, something else has moved it."""
+    """If an arm is even farther behind its reference, something else has moved it."""
     assert found(robot, dict.fromkeys(SIDES, 0.6), 1.2) == pytest.approx(dict.fromkeys(SIDES, 0.4), abs=0.011)
 
 
 def test_a_resting_arm_gets_the_same_lag_as_the_moving_arm(robot: Robot) -> None:
-    """Every lag would explain the posture of the resting arm, so the lag of the other arm is taken."""
+    """The posture of the resting arm fits every lag, so the lag of the other arm is used."""
     watch, left = MeasuredLags(robot), robot.arms["left"].joints
 
     def at(t: float) -> Array:

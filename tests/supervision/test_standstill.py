@@ -1,4 +1,4 @@
-"""A controller that stands still while joint states go on is found. Arms that lag or reverse are not reported."""
+"""A controller that stands still is found although joint states arrive. Arms that lag or reverse are not reported."""
 
 from __future__ import annotations
 
@@ -61,14 +61,14 @@ def findings(
     """Yield the times at which the watch reports an arm [s].
 
     The arm follows its commands with a ``delay`` [s] and a first-order ``lag`` [s]. From ``frozen_at`` on, its driver
-    holds the last command. ``heard(t)``: whether a state arrives. ``ticks(t)``: whether the loop ticks; otherwise no
-    command is sent.
+    holds the last command. A state can arrive at the time t only if ``heard(t)`` is True. The loop ticks and sends a
+    command only if ``ticks(t)`` is True.
     """
     watch, measured, stamp, command = StandstillWatch(limits), asked(0.0), 0.0, asked(0.0)
     seen, next_state = measured, 0.0
     for t in np.arange(0.0, seconds, DT):
         measured = measured + (command - measured) * (DT / lag)
-        if t < frozen_at and ticks(t):  # The arm follows the command of one tick until the next tick.
+        if t < frozen_at and ticks(t):  # The command of a tick is valid until the next tick.
             command = asked(t - delay)
         if t >= next_state and heard(t):
             seen, stamp, next_state = measured, t, next_state + state_period
@@ -85,7 +85,7 @@ def test_a_driver_that_stops_during_motion_is_found_within_a_tenth_of_a_second(
     assert FROZEN_AT < found < FROZEN_AT + WITHIN + DT
 
 
-def test_if_a_driver_never_begins_to_follow_it_is_found_before_the_command_is_0_1_rad_away() -> None:
+def test_a_driver_that_never_begins_to_follow_is_found_before_the_command_is_0_1_rad_away() -> None:
     asked = ramp(1.2, 8.0)
     found = next(findings(JOINTS, asked, frozen_at=0.0))
     assert float(np.abs(asked(found)).max()) < 0.1

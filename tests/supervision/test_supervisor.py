@@ -35,7 +35,7 @@ class World:
 
     @property
     def states(self) -> list[str]:
-        """Return the activities of the left arm and the right one."""
+        """Return the activities of the left arm and of the right arm."""
         return [self.supervisor.arm_state(arm) for arm in ("left", "right")]
 
     def measured_tool(self, arm: str) -> pin.SE3:
@@ -198,7 +198,7 @@ def test_the_end_of_a_stream_may_stop_only_its_own_arm(world: World, linked: boo
 
 def test_a_loop_that_stood_still_commands_nothing_and_follows_no_old_target(world: World) -> None:
     world.engage(by=0.1)
-    rest, before = world.q, len(world.commanded)  # As far as is known, the robot has come to rest here by itself.
+    rest, before = world.q, len(world.commanded)  # While the loop stands still, the robot rests here.
     waited = world.tool("left")
     world.now += 1.0
     world.supervisor.stalled(1.0, world.now)

@@ -1,4 +1,4 @@
-"""Late messages and second publishers are noticed. Even motion stays even if sender and loop have different periods."""
+"""Late messages and second publishers are noticed. Uniform motion stays uniform if sender and loop are not in step."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_two_publishers_that_alternate_are_found_at_the_third_and_fifth_message(
     assert all(count >= 2 for count in found[4:])
 
 
-def test_skipped_numbers_are_no_break_and_the_numbers_of_a_new_publisher_count_as_one_break_for_a_time() -> None:
+def test_skipped_sequence_numbers_are_no_break_and_a_new_publisher_causes_one_break_which_later_expires() -> None:
     assert not any(breaks([7, 8, 9, 20, 21, 60, 61]))
     found = breaks([*range(500, 520), *range(1, 150)])
     assert found[19:21] == [0, 1]
@@ -85,7 +85,7 @@ def test_skipped_numbers_are_no_break_and_the_numbers_of_a_new_publisher_count_a
 
 
 @pytest.mark.parametrize(("number", "found"), [(190, 0), (220, 1)], ids=["its own number", "another's number"])
-def test_numbers_may_skip_only_as_many_messages_as_one_publisher_sends_in_a_tenth_of_a_second(
+def test_sequence_numbers_may_skip_at_most_as_many_messages_as_one_publisher_sends_in_a_tenth_of_a_second(
     number: int, found: int
 ) -> None:
     """The publisher sends at most 2000 messages in a second. All but the newest were lost while the network stalled."""
@@ -94,14 +94,14 @@ def test_numbers_may_skip_only_as_many_messages_as_one_publisher_sends_in_a_tent
     assert watch.take(number, 0.001, STREAM_TIMEOUT) == found
 
 
-def test_a_repeated_number_is_a_break_and_each_break_counts_for_one_second() -> None:
+def test_a_repeated_sequence_number_is_a_break_and_each_break_counts_for_one_second() -> None:
     watch = SequenceWatch()
     found = [watch.take(number, now, STREAM_TIMEOUT) for number, now in ((5, 0.0), (5, 0.1), (6, 0.2), (6, 0.3))]
     assert found == [0, 1, 1, 2]
     assert [watch.take(7 + k, 0.35 + 0.1 * k, STREAM_TIMEOUT) for k in range(12)] == [2] * 8 + [1, 1, 0, 0]
 
 
-def test_numbers_that_begin_again_after_a_silence_are_no_break() -> None:
+def test_sequence_numbers_that_start_again_after_a_silence_are_no_break() -> None:
     watch = SequenceWatch()
     for number in range(100):
         watch.take(number, PERIOD * number, STREAM_TIMEOUT)
@@ -122,7 +122,7 @@ def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitte
     """Return the loop's target at each tick.
 
     The sender and the loop tick late by up to ``jitter`` [s]. A message takes 0.5 ms and up to ``jitter`` more.
-    ``lines``: whether the time at which each target is due is known, so that targets are extrapolated.
+    If ``lines`` is True, the time at which each target is due is known, so that targets are extrapolated.
     """
     random, line, clock = np.random.default_rng(0), TargetExtrapolator(), TickClock(LOOP)
     sent = [SENDER * k + random.uniform(0.0, jitter) for k in range(int(until / SENDER))]
@@ -144,7 +144,7 @@ def ripple(targets: list[pin.SE3]) -> float:
     return float(np.std(speeds) / np.mean(speeds))
 
 
-def test_an_even_motion_stays_even_only_with_extrapolation() -> None:
+def test_a_uniform_motion_stays_uniform_only_with_extrapolation() -> None:
     assert ripple(played(circling, 3.0, lines=True)) < 0.02
     assert ripple(played(circling, 3.0, lines=False)) > 0.3
 
@@ -171,7 +171,7 @@ def test_a_jump_of_the_target_is_not_extrapolated_as_a_motion() -> None:
         assert found.translation[2] in (0.0, 0.002)
 
 
-def test_an_even_turn_is_extrapolated_if_the_sender_is_as_slow_as_a_headset() -> None:
+def test_a_uniform_turn_is_extrapolated_if_the_sender_is_as_slow_as_a_headset() -> None:
     line, period, velocity = TargetExtrapolator(), 1.0 / 72.0, np.array([0.3, -0.4, 0.5])  # [s], [rad/s]
     for k in range(5):
         line.put(pin.SE3(pin.exp3(velocity * k * period), np.zeros(3)), k * period)

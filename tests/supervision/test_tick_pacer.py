@@ -49,14 +49,14 @@ def test_after_a_late_tick_slow_motion_catches_up_and_fast_motion_continues_late
     assert fast.missed_ticks == 24
 
 
-def test_if_the_plant_coasts_the_reference_moves_on_for_up_to_a_tenth_of_a_second() -> None:
+def test_if_the_plant_moves_on_without_commands_the_reference_moves_on_for_up_to_a_tenth_of_a_second() -> None:
     pacer = TickPacer(PERIOD, LIMIT, ACCELERATION, coasts=True)
     assert [pacer.step(gap, LIMIT) for gap in (0.09, 0.3)] == [0.09, 0.1]
     assert pacer.stretched == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("slow", [1.0, 1.001], ids=["at its period", "that ticks slightly slower"])
-def test_the_tick_clock_gives_even_and_punctual_times_to_jittering_ticks(slow: float) -> None:
+def test_the_tick_clock_gives_evenly_spaced_and_punctual_times_to_ticks_with_jitter(slow: float) -> None:
     clock, random = TickClock(PERIOD), np.random.default_rng(1)
     ran = slow * PERIOD * np.arange(2000) + random.uniform(0.0, 6e-4, 2000)
     counted = np.array([clock.at(t) for t in ran])
@@ -89,7 +89,7 @@ def test_the_tick_clock_starts_anew_after_a_long_gap_and_after_the_clock_was_set
     assert clock.at(now + PERIOD) == pytest.approx(now + PERIOD)
 
 
-def test_the_tick_clock_stands_still_while_the_clock_is_back_by_less_than_a_period() -> None:
+def test_the_tick_clock_stands_still_after_the_clock_was_set_back_by_less_than_a_period() -> None:
     clock = ten_ticks()
     last = clock.at(10 * PERIOD)
     assert clock.at(9.5 * PERIOD) == last
@@ -103,7 +103,7 @@ STRONGEST = np.array([LIMITS.max_acceleration, LIMITS.max_angular_acceleration])
 
 
 class Watched:
-    """A guard whose every step is checked against its limits."""
+    """A guard whose steps are all compared with its limits."""
 
     def __init__(self, start: pin.SE3 | None = None, period: float = DT) -> None:
         self.guard, self._period = PoseRateLimiter(LIMITS, period), period
@@ -147,7 +147,7 @@ def moving() -> Watched:
 
 
 def circle(t: float, radius: float, period: float) -> pin.SE3:
-    """Return the pose at ``t`` [s] on a circle through the origin, which is turned to and fro on the way.
+    """Return the pose at ``t`` [s] on a circle through the origin, which turns to and fro while it moves.
 
     The motion accelerates for half a second.
     """
@@ -220,7 +220,7 @@ Target = st.none() | st.tuples(*[Coordinate] * 6)
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(Target, st.integers(1, 30), st.sampled_from([0.001, 0.01, 0.013, 0.1, 1.0])), max_size=8))
-def test_no_sequence_of_targets_breaks_a_limit(
+def test_for_every_sequence_of_targets_all_limits_are_kept(
     sequence: list[tuple[tuple[float, ...] | None, int, float]],
 ) -> None:
     watched = Watched()

@@ -78,7 +78,7 @@ def dask_cluster(folder: Path, workers: int = 2) -> Iterator[DaskCluster]:
 
 
 def die_once(folder: Path) -> None:
-    """End the calling process at once. Later calls do nothing: a file in ``folder`` remembers the first call."""
+    """End the calling process at once. Later calls do nothing, because a file in ``folder`` marks the first call."""
     try:
         (folder / "died").touch(exist_ok=False)
     except FileExistsError:

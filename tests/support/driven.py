@@ -13,7 +13,7 @@ from q2r2_control.types import Array, Reference
 from q2r2_control.verification.contract import Contract
 
 Targets = Mapping[str, pin.SE3 | None]
-# The arguments are the time since the start [s] and the tool poses at the start, by arm.
+# The arguments are the time since the start [s] and the tool pose of each arm at the start.
 Scenario = Callable[[float, Mapping[str, pin.SE3]], Targets]
 
 

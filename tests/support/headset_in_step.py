@@ -92,7 +92,7 @@ class Operator:
             self.wait_until_read()
 
     def lose(self, end: Callable[[FakeHeadset], None]) -> None:
-        """End the connection by the function ``end``, and wait until the server has noticed the loss."""
+        """End the connection with the function ``end``, and wait until the server has noticed the loss."""
         assert self.headset is not None
         end(self.headset)
         self.headset = None

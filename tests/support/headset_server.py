@@ -100,7 +100,7 @@ def next_topic(headset: FakeHeadset) -> str:
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """Return warnings and errors of this package. Those of libraries depend on timing and are left out."""
+    """Return warnings and errors of this package. Warnings of libraries are left out, because they depend on timing."""
     own = (record for record in caplog.records if record.name.startswith("q2r2_control"))
     return [record.getMessage() for record in own if record.levelno >= logging.WARNING]
 

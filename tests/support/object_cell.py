@@ -21,7 +21,7 @@ _DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at hom
 
 
 def cell(left: dict[str, Any] | None, right: dict[str, Any] | None = None) -> Config:
-    """Return the shipped cell with these objects for the grippers, or None. No result depends on the clock."""
+    """Return the shipped cell with an object for each gripper, or None for no object. It has no limit of solve time."""
     data = load_config("config/dual_iiwa7.yaml").model_dump()
     data["arms"]["left"]["gripper"]["object"], data["arms"]["right"]["gripper"]["object"] = left, right
     data["control"]["solve_time_limit"] = None

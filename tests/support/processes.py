@@ -67,7 +67,7 @@ _OTHER_BLOCKS = {
 
 
 def pipeline_of(changes: Mapping[str, object], source: Input, plant: Plant | str, mode: str) -> Pipeline:
-    """Return a pipeline for the shipped cell. ``changes`` replaces blocks of the cell, by their keys.
+    """Return a pipeline for the shipped cell. ``changes`` maps keys of the cell to new blocks.
 
     If no change concerns the robot, the pipeline uses the shared robot of :func:`cell_robot`.
     """
@@ -79,7 +79,7 @@ def pipeline_of(changes: Mapping[str, object], source: Input, plant: Plant | str
 
 
 class Watch:
-    """A listener that keeps every tick, and fails the run at the first tick that breaks the contract."""
+    """A listener that stores every tick, and fails the run at the first tick that violates the contract."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self.ticks: list[Tick] = []

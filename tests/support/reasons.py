@@ -1,4 +1,4 @@
-"""Returns the kinds of the reasons of events, so that assertions need no sentences."""
+"""Reasons of events as short texts of their kinds, so that tests do not depend on the sentences for operators."""
 
 from __future__ import annotations
 

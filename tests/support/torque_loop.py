@@ -25,7 +25,7 @@ _NO_REPORT = StepReport(StepStatus.OK, (), (), ("", ""), np.inf, True, False, 0.
 
 
 def reference(q: Array, v: Array | None = None, a: Array | None = None) -> Reference:
-    """Return a reference without a controller. It rests if ``v`` and ``a`` are left out."""
+    """Return a reference that no controller has computed. It rests if ``v`` and ``a`` are left out."""
     zero = np.zeros_like(q)
     return Reference(q, zero if v is None else v, zero if a is None else a, _NO_REPORT)
 
@@ -47,7 +47,7 @@ class TorqueLoop:
         self._last: Array = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
 
     def tick(self) -> TorqueCommand:
-        """Do one tick, and assert every bound."""
+        """Do one tick, and assert the bounds on each torque and on its change."""
         command = self.controller.step(self.reference, self.state, self.dt)
         # A torque that is not finite fails these assertions as well.
         assert (np.abs(command.tau) <= self._limit).all()

@@ -1,8 +1,8 @@
-"""A hand with turning fingers like those of a Robotiq 2F-85, on both arms of the shipped cell.
+"""A hand whose fingers turn as in a Robotiq 2F-85, on both arms of the shipped cell.
 
 The gripper turns the knuckle of each finger by 0.8 rad. The fingertip turns back by the same angle, so that both tips
 stay parallel, and a second knuckle turns with the first one. When the hand closes, the tips move 14 mm away from the
-palm. The axes are those in the published drawings of the 2F-85. The shapes are simple, and have about the size of the
+palm. The axes are taken from the published drawings of the 2F-85. The shapes are simple, and have about the size of the
 2F-85.
 """
 

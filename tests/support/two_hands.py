@@ -23,8 +23,8 @@ Motion = Callable[[float], pin.SE3]
 class TwoHands:
     """Both hands hold one moving object. Each hand sways on its own, trembles, and is measured with noise.
 
-    ``sway``: RMS of each hand's own motion at 0.4 .. 2 Hz, along each axis [m] and about each axis [rad]. Hands that
-    hold a cardboard box, which yields under the grips, sway by some millimetres and degrees.
+    ``sway`` is the RMS of each hand's own motion at 0.4 .. 2 Hz, along each axis [m] and about each axis [rad]. A
+    cardboard box yields under the grips, so the hands that hold it sway by some millimetres and degrees.
     """
 
     def __init__(

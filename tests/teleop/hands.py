@@ -123,7 +123,7 @@ class Operator:
         self.run(0.1)
 
     def place(self, arm: str = "left") -> pin.SE3:
-        """Return the target pose of an arm (world frame). The arm has to follow something."""
+        """Return the target pose of an arm in the world frame. The arm must have a target."""
         target = self.targets[arm].pose
         assert target is not None
         return target

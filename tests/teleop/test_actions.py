@@ -153,7 +153,7 @@ class TestAGripperThatFollowsATrigger:
         driver.run(0.1)
         return driver
 
-    def test_a_gripper_closes_as_far_as_the_trigger_and_opens_no_faster_than_the_setting(self) -> None:
+    def test_a_gripper_closes_as_far_as_the_trigger_is_pushed_and_opens_no_faster_than_the_setting(self) -> None:
         driver = self.driver(gripper_speed=2.0)
         for pressed, opening in ((0.5, 0.5), (1.0, 0.0), (0.275, 0.75), (0.0, 1.0)):
             driver.held = {"trigger": pressed}

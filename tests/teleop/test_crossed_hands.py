@@ -37,7 +37,7 @@ def after(places: Places, seconds: float = 5.0, axes: tuple[str, str, str] = WOR
 
 
 def swapped(by: float = 0.4, heading: float = 0.0, turns: float = 0.0) -> Places:
-    """Return the poses of resting hands that are ``by`` [m] on the wrong side of each other.
+    """Return the poses of resting hands. The left hand is ``by`` [m] to the right of the right hand.
 
     The operator faces ``heading`` [rad]. Each controller is turned outwards by ``turns`` [rad].
     """

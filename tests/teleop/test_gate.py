@@ -145,7 +145,7 @@ def test_samples_that_a_network_delays_and_delivers_together_cause_no_speed_faul
     assert faults_of_a_motion(2.0, sorted(receipts)) == [""] * len(EVEN)
 
 
-def test_a_jump_is_one_fault_and_does_not_count_as_speed_afterwards() -> None:
+def test_a_jump_is_one_fault_and_causes_no_speed_fault_afterwards() -> None:
     passed = PoseGate(GateSettings(max_speed=1.0))
     for stamp in EVEN[:10]:
         passed.receive(sample("left", pose(), stamp), stamp)

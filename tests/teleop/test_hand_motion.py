@@ -9,7 +9,7 @@ from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, waving
 
-SAG = np.array([0.005, 0.0, -0.02])  # Measured position of a tool minus the commanded one [m].
+SAG = np.array([0.005, 0.0, -0.02])  # Measured position of a tool minus its commanded position [m].
 
 
 def hanging(driver: Operator, by: Array = SAG) -> Operator:

@@ -158,7 +158,7 @@ def test_a_second_vibration_waits_until_the_first_has_ended_but_a_fault_does_not
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * pulses.FAULT.amplitude, 0.0]), (0.0, [])])
-def test_a_setting_scales_the_strength_of_all_vibrations_and_no_vibration_is_sent_if_it_is_0(
+def test_a_setting_scales_the_strength_of_all_vibrations_and_no_vibration_is_sent_if_the_setting_is_0(
     strength: float, expected: list[float]
 ) -> None:
     haptics = HapticPulses(HapticSettings(strength=strength))

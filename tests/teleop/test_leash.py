@@ -103,7 +103,9 @@ def test_a_taut_leash_keeps_the_target_at_the_leashs_length_and_the_slip_is_the_
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a quaternion", "the other one of the same rotation"])
 @pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
-def test_a_target_is_held_only_when_it_is_at_the_end_of_the_leash(turning: bool, sign: float) -> None:
+def test_the_leash_changes_a_target_only_if_its_distance_exceeds_the_length_of_the_leash(
+    turning: bool, sign: float
+) -> None:
     leash, length = Leash(LeashSettings(distance=0.1, angle=0.5)), 0.5 if turning else 0.1
     position, (a, b, c, w) = floats_of(TOOL)
     tool = position, (sign * a, sign * b, sign * c, sign * w)
@@ -244,10 +246,10 @@ def test_a_blocked_arm_rests_and_then_follows_the_returning_hand_at_once_without
     way = places @ out / farthest
     speed = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1) * RATE
     start, held, soon, later = np.searchsorted(t, np.array([0.4, HELD, HELD + 0.25, HELD + 0.45]) - 1e-9)
-    assert way[held] - way[start] < farthest - 0.45  # The tool stopped at least 0.45 m short of the hand.
+    assert way[held] - way[start] < farthest - 0.45  # The tool moved at least 0.45 m less than the hand.
     resting = (t > HELD - 0.5) & (t < HELD)
     acceleration = np.array([np.linalg.norm(tick.reference.a) for tick in ticks])[resting]
-    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # For an arm in free motion this is 0.39.
+    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # An arm in free motion has 0.39 rad/s^2.
     assert speed[resting].max() < 0.01
     # The hand comes back by 2 mm. An almost straight arm has moved by only a part of this at ``soon``. An arm that was
     # pushed aside also comes back to its path, so it may move by more than 2 mm.

@@ -25,7 +25,8 @@ AXIS = np.array([0.6, 0.0, 0.8])  # Axis about which the hand turns.
 class Filtered:
     """The filtered poses of a hand that moves along x and turns.
 
-    ``plain`` contains the poses of the filter alone, and ``drawn`` those with the mean of the samples at rest.
+    ``plain`` contains the poses of the filter alone. ``drawn`` contains poses that are moved towards the mean of the
+    samples while the hand rests.
     """
 
     def __init__(self, noise: float = NOISE) -> None:

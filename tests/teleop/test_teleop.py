@@ -169,7 +169,7 @@ DT = 0.002
 def tracking_error(script: ScriptedInput, duration: float) -> tuple[float, float]:
     """Return the RMS distance [mm] and the RMS angle [deg] between the left target and its ideal pose.
 
-    The ideal pose repeats the hand's motion later by the delay of the filter. All ticks with an engaged arm count.
+    The ideal pose repeats the hand's motion with the delay of the filter. All ticks with an engaged arm count.
     """
     teleop = Teleop(TeleopSettings(), SIDES)
     tools = {"left": pose(0.5, 0.4, 0.5, (3.0, 0.1, 0.2)), "right": pose(0.5, -0.4, 0.5)}

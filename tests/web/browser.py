@@ -75,7 +75,7 @@ class WebRun:
         self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End a run that a failed test has left. Otherwise it would occupy a processor during the next test."""
+        """End a run that still runs after a failed test. Otherwise it would occupy a processor during the next test."""
         self._process.kill()
         self._process.communicate()
 

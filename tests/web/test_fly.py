@@ -1,6 +1,6 @@
 """On the page for headsets, keys and a gamepad move a virtual hand.
 
-Its poses pass the same gate, anchor and leash as those of a headset.
+Its poses pass the same gate, anchor and leash as the poses of a headset.
 """
 
 from __future__ import annotations

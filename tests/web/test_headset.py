@@ -184,7 +184,7 @@ def test_bare_hands_move_no_arm_after_the_operator_has_laid_down_the_controllers
     assert run.end()["at_rest"]
 
 
-def test_the_first_headset_drives_and_the_page_of_a_second_headset_says_that_another_one_drives(
+def test_the_first_headset_drives_and_the_page_of_a_second_headset_says_that_another_headset_drives(
     enter: Any, start: Start, open_page: Open
 ) -> None:
     run = start(*RUN)

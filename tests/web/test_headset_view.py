@@ -87,7 +87,7 @@ def test_texts_name_the_controls_of_the_device_that_is_used(run: ShownRun, open_
 
 
 @pytest.mark.parametrize("flies", [False, True], ids=["looking on", "flying"])
-def test_no_element_covers_another_one_on_a_phone(run: ShownRun, open_page: Open, flies: bool) -> None:
+def test_on_a_phone_no_element_of_the_page_covers_another_element(run: ShownRun, open_page: Open, flies: bool) -> None:
     page = opened(run, open_page)
     page.set_viewport_size({"width": 390, "height": 800})
     if flies:

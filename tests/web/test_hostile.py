@@ -27,7 +27,7 @@ from q2r2_control.viewer.web.server import LimitedAnswers
 from q2r2_control.viewer.web.view import PageView
 from tests.pipeline.loops import pipeline
 
-SECONDS = 1.5  # Duration of each run.
+SECONDS = 1.5  # Duration of each run [s].
 NOISE = np.random.default_rng(7)
 
 
@@ -47,7 +47,7 @@ def joined(url: str) -> ClientConnection:
 def played(loop: Pipeline, acts: Mapping[float, Callable[[], object]]) -> Array:
     """Return the joint positions (ticks, nv) of a run in simulated time [rad].
 
-    ``acts`` are functions to call, by the time of the run at which they are called [s].
+    ``acts`` has the functions that are called during the run. Their keys are the times of the calls [s].
     """
     positions, due = [], sorted(acts)
 

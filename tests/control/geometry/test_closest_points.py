@@ -51,7 +51,7 @@ def _to_segment(point: Array, start: Array, end: Array) -> float:
 
 
 def _least_distance(segments: Segments) -> float:
-    """Return the least distance of two segments. The method differs from that of the kernel.
+    """Return the least distance of two segments. The method differs from the kernel's method.
 
     The squared distance is a convex quadratic function of (s, t). On the unit square, it is least at its unconstrained
     minimum if this minimum lies inside, otherwise on a side.
@@ -127,7 +127,7 @@ def _boxes_and_segments(count: int, spread: float = 1.0) -> Iterator[tuple[Array
     yield from zip(a0, a1, half, _nearest_along(a0, a1, half).tolist(), strict=True)
 
 
-def test_the_distance_of_a_segment_outside_a_box_is_that_of_its_nearest_point() -> None:
+def test_the_distance_of_a_segment_outside_a_box_equals_the_distance_of_its_nearest_point() -> None:
     outside = 0
     for a0, a1, half, expected in _boxes_and_segments(1000):
         if expected < 1e-6:

@@ -14,7 +14,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, arrays_of, cell, distances, placed, random_posture
 
-# Coal computes the distance of two capsules in closed form, and that of a capsule and a box by iteration.
+# Coal computes the distance of two capsules in closed form, and the distance of a capsule and a box by iteration.
 EXACT, ITERATED = 1e-9, 1e-4
 STEP = 1e-6  # Step of finite differences [rad].
 
@@ -76,7 +76,8 @@ def _assert_rows_are_gradients(arrays: CellArrays, q: Array) -> tuple[int, int]:
     data, cores_meet = placed(arrays, q), _core_distance(arrays)
     outside = penetrating = 0
     for p, distance in enumerate(here):
-        # Where the closest points jump, there is no gradient. Two step sizes give different results there.
+        # Where the closest points jump, there is no gradient, and two step sizes give different results. Such pairs are
+        # left out.
         smooth = np.abs(slopes[:, p] - coarse[:, p]).max() < 1e-4
         if distance < cores_meet[p] + 1e-3 or not smooth:
             continue
@@ -95,7 +96,7 @@ def test_rows_are_the_gradients_of_the_distances(seed: int, name: str) -> None:
 
 
 def _way_bound(arrays: CellArrays, way: Array) -> Array:
-    """Return the bound S of stop_certificate.py per pair (p,) [m], if the joints travel ``way`` (nv,) [rad or m]."""
+    """Return for each pair (p,) the bound S [m] of stop_certificate.py if joints travel ``way`` (nv,) [rad or m]."""
     padded = np.concatenate([[0.0], way])
     return np.asarray((arrays.pairs.reach * padded[arrays.pairs.joint]).sum(axis=1))
 
@@ -109,7 +110,8 @@ def test_no_distance_changes_by_more_than_the_bound_computed_from_the_travel_of_
     q = random_posture(arrays.robot, random)
     other = np.clip(q + random.uniform(-size, size, len(q)), arrays.robot.position_lower, arrays.robot.position_upper)
     here, there = distances(arrays, np.array([q, other]))
-    # If a segment enters a box over an edge, the direction of the shortest translation out of the box jumps.
+    # Pairs whose cores meet are not compared: if a segment enters a box over an edge, the direction of the shortest
+    # translation out of the box jumps.
     comparable = np.minimum(here, there) > _core_distance(arrays) + 1e-9
     excess = np.abs(here - there) - _way_bound(arrays, np.abs(other - q))
     assert excess[comparable].max() <= 1e-12

@@ -60,6 +60,8 @@ UNSUPPORTED: dict[str, Callable[[], object]] = {
 
 
 @pytest.mark.parametrize("joint", UNSUPPORTED.values(), ids=UNSUPPORTED.keys())
-def test_a_joint_that_is_neither_revolute_nor_prismatic_is_refused_by_name(joint: Callable[[], object]) -> None:
+def test_the_error_about_a_joint_that_is_neither_revolute_nor_prismatic_names_the_joint(
+    joint: Callable[[], object],
+) -> None:
     with pytest.raises(RobotError, match=r"joint_1.*revolute and prismatic"):
         chain_of(_model(pin.JointModelRZ(), joint()))

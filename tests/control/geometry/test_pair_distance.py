@@ -68,7 +68,8 @@ def _looked_at(
 ) -> tuple[float, Array]:
     """Return the smooth or the exact distance of pair ``p`` [m], and the row (nv,) that is its gradient.
 
-    If ``data`` of the cell are given, they are used again, which saves most of the time.
+    If ``data`` of the cell are given, they are overwritten. This is faster, because making new data takes most of the
+    time.
     """
     data, row = data or placed(arrays, q), np.zeros(len(q))
     update_placements(arrays.collision, data, q)

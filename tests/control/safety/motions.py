@@ -1,4 +1,4 @@
-"""A step and the stop after it, as the kernels certify them and as dense samples."""
+"""A motion is a step and the stop after it. The kernels get it as velocities, and tests as dense samples."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DENSE = 500  # Number of samples of a motion.
 
 @dataclass(frozen=True)
 class Motion:
-    """A step and the stop after it."""
+    """A step and the stop after it: the posture and the velocities at the step, and the decelerations in the stop."""
 
     q: Array
     v: Array

@@ -26,9 +26,9 @@ def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_i
     random, robot, model = np.random.default_rng(91), cell(name).robot, kernel_model(name).safety
     right, kept = robot.arms["right"].joints, model.min_distance.copy()
     bound_used: list[float] = []
-    lost: dict[int, list[float]] = {1: [], 2: []}  # True least distance minus proven distance, by proof [m].
+    lost: dict[int, list[float]] = {1: [], 2: []}  # For each proof, true least distance minus proven distance [m].
     for number in range(12):
-        # Arms at rest, and arms that have moved at a constant velocity. Then they accelerate for one step.
+        # The arms have rested, or have moved at a constant velocity. Then they accelerate for one step.
         v = (number % 2) * 0.3 * random.uniform(-robot.velocity_limit, robot.velocity_limit)
         v_next = v + random.uniform(-1.0, 1.0, robot.model.nv) * ACCELERATION * H
         motion = motion_of(name, random_posture(robot, random), v, v_next, shape)
@@ -56,9 +56,9 @@ def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_i
             model.min_distance[p] = kept[p]
             assert least >= proven - 1e-8
             bound_used.append((distance - least) / (distance - proven))
-            for proof, other in ((1, 2), (2, 1)):  # First with few instants of the stop, then with four times as many.
+            for proof, other in ((1, 2), (2, 1)):  # Proof 2 uses four times as many instants as proof 1.
                 bend = data.history.bend[other].copy()
-                data.history.bend[other] = np.inf  # The other proof then proves nothing.
+                data.history.bend[other] = np.inf  # With this, the other proof proves nothing.
                 proven = _largest(partial(keeps_apart_at_any_time, model, data, p, duration), distance)
                 data.history.bend[other] = bend
                 assert least >= proven - 1e-8
@@ -74,7 +74,10 @@ def _counts_as_far(model: SafetyModel, data: SafetyData, p: int, time: float, th
 
 
 def _largest(holds: Callable[[float], bool], distance: float) -> float:
-    """Return the greatest threshold for which ``holds`` is true, to 1 nm, within 1 m of ``distance`` [m]."""
+    """Return the greatest threshold [m] for which ``holds`` is True. The result is exact to 1 nm.
+
+    Only thresholds that differ from ``distance`` [m] by at most 1 m are tried.
+    """
     low, high = distance - 1.0, distance + 1.0
     while high - low > 1e-9:
         middle = 0.5 * (low + high)

@@ -30,7 +30,7 @@ def _box(q: Array, v: Array, bounds: JointLimits, h: float) -> tuple[VelocityBox
 
 
 def _stoppable(room: Array, v: Array, bounds: JointLimits) -> npt.NDArray[np.bool_]:
-    """Return by joint whether condition P of joint_limits.py holds towards one limit, except for rounding errors."""
+    """Return for each joint whether condition P of joint_limits.py holds towards one limit, to within rounding."""
     return np.where(
         v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest_step * v <= room + EXACT
     )

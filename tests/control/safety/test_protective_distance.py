@@ -1,4 +1,4 @@
-"""The bound on how far an obstacle can have moved since its report is the fastest motion that its bounds allow."""
+"""The bound on how far an obstacle has moved since its report is the distance of its fastest allowed motion."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from tests.control.cells import behind
 
 
 @pytest.mark.parametrize("slower", [0.0, 0.1, 0.5], ids="slower by {} m/s".format)
-def test_the_reach_of_an_obstacle_is_that_of_its_fastest_allowed_motion(slower: float) -> None:
-    """The obstacle gains speed evenly from its report on, until it has its greatest speed."""
+def test_the_reach_of_an_obstacle_is_the_distance_of_its_fastest_allowed_motion(slower: float) -> None:
+    """From its report on, the obstacle accelerates at a constant rate until it has its greatest speed."""
     speed, rise = 0.5, 0.2
     empty, none = np.zeros(1), np.zeros(2, dtype=np.int64)
     bounds_of_speed = np.full(1, speed), np.full(1, slower), np.full(1, rise)

@@ -41,7 +41,7 @@ def test_no_joint_was_farther_from_its_present_position_during_the_window_than_t
         assert (history.travel <= 3.0 * travel + 1e-6).all(), "the bound is not far too large"
 
 
-def test_a_window_that_is_switched_on_again_begins_at_0_and_grows_by_each_step() -> None:
+def test_after_the_window_was_0_the_known_part_of_a_new_window_starts_at_0_and_grows_with_each_step() -> None:
     robot, data = cell(NAMES[0]).robot, kernel_data(NAMES[0], cell(NAMES[0]).robot.home).safety
     history, still = data.history, np.zeros(robot.model.nv)
     history.window[1] = WINDOW
@@ -54,7 +54,7 @@ def test_a_window_that_is_switched_on_again_begins_at_0_and_grows_by_each_step()
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_turning_of_a_joint_counts_the_motions_of_all_joints_that_carry_it(name: str) -> None:
+def test_the_turning_of_a_joint_depends_on_the_motions_of_all_joints_between_the_base_and_this_joint(name: str) -> None:
     motion = np.random.default_rng(4).uniform(0.0, 1.0, cell(name).robot.model.nv)
     for joint, carriers in enumerate(cell(name).robot.model.supports):
         if joint == 0:

@@ -23,7 +23,7 @@ H = 0.002
 
 
 def started() -> SafetyData:
-    """Return the data of a filter at home, with slow motion, a certified stop, and the box of the next step."""
+    """Return the data of a filter. The arms move slowly at home, with a certified stop and the next velocity box."""
     data = kernel_data("dual_iiwa7", HOME, V).safety
     data.distance[:] = distances(cell("dual_iiwa7"), HOME[None])[0]
     assert certify_start(MODEL, data)

@@ -56,7 +56,7 @@ def test_a_proven_distance_holds_during_the_whole_step_and_is_often_close_to_the
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_pair_that_opens_from_exactly_its_threshold_is_proven_to_stay_beyond_the_threshold(name: str) -> None:
-    """A bound from the distance alone would fail, because it needs a free distance of half of the joints' travel."""
+    """A bound that uses only the distance at the start would fail: it needs a free distance for half of the travel."""
     random, robot = np.random.default_rng(22), cell(name).robot
     parted = 0
     for _ in range(40):

@@ -34,9 +34,9 @@ from tests.control.cells import (
 APPROACH = kernel_model("dual_iiwa7").safety.approach
 STOP_DISTANCE = float(APPROACH.stop_distance[0])
 H = 0.001
-SAME_DISTANCE = 0.002  # An instant has a row if its distance exceeds the least distance by no more than this [m].
-SAME_POINT = 0.005  # An end has a row of its own if it is farther than this from the closest point [m].
-CLEAR = 2e-5  # A condition that holds or fails by less than this is not judged [m].
+SAME_DISTANCE = 0.002  # An instant has a row if its distance exceeds the stop's least distance by at most this [m].
+SAME_POINT = 0.005  # A segment's end has its own row if it is farther than this from the closest point [m].
+CLEAR = 2e-5  # If a condition holds or fails by less than this, the test does not check the row [m].
 
 
 class Seen:
@@ -84,7 +84,9 @@ def test_distances_of_near_pairs_are_exact_and_other_distances_are_never_too_lar
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES), speed=st.floats(0.05, 1.0))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_a_pair_that_approaches_fast_is_examined_early_enough(seed: int, name: str, speed: float) -> None:
+def test_a_pair_that_approaches_fast_counts_as_near_before_its_rows_become_necessary(
+    seed: int, name: str, speed: float
+) -> None:
     q, v = _state(name, seed, speed)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     before, after = distances(cell(name), q + 1e-6 * np.array([[-1.0], [1.0]]) * v)
@@ -115,7 +117,9 @@ def _gradient(arrays: CellArrays, q: Array, p: int) -> Array:
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_every_pair_that_is_too_close_gets_a_row_that_opens_it_at_bounded_speed(seed: int, name: str) -> None:
+def test_every_pair_that_is_too_close_gets_a_row_that_moves_its_bodies_apart_at_bounded_speed(
+    seed: int, name: str
+) -> None:
     q, v = _state(name, seed, 0.0)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     for p in np.flatnonzero(exact < STOP_DISTANCE - 1e-3).tolist():
@@ -127,14 +131,14 @@ def test_every_pair_that_is_too_close_gets_a_row_that_opens_it_at_bounded_speed(
 
 
 def _least_free(name: str, q: Array, v: Array, duration: float, p: int) -> float:
-    """Return B, the least free distance of a pair during a stop from (q, v) that is straight in joint space [m]."""
+    """Return B [m], the least free distance of a pair during a stop from (q, v) that is straight in joint space."""
     way = np.linspace(0.0, 0.5 * duration, 33)[:, None] * v
     return float(distances(cell(name), q + way, pairs=np.array([p])).min()) - STOP_DISTANCE
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_velocities_that_satisfy_the_rows_use_up_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
-    """Velocities that break the rows use up free distance faster, so the rows are neither too lax nor too strict."""
+def test_velocities_that_satisfy_the_rows_reduce_the_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
+    """Velocities that violate the rows reduce it faster, so the rows are neither too lax nor too strict."""
     random, kept, broken = np.random.default_rng(5), 0, 0
     for seed in range(150):
         q, v = _state(name, seed, 0.4)
@@ -161,15 +165,15 @@ def test_velocities_that_satisfy_the_rows_use_up_free_distance_no_faster_than_th
 
 
 class _Candidate(NamedTuple):
-    """A row that the documented rule allows, and by how much the conditions hold under which it is written."""
+    """A row that the documented rule describes, and the margin with which the conditions for writing it hold."""
 
     row: Array  # (nv,) Unit vector.
     lower: float  # [rad/s]
-    margin: float  # The smallest margin of the conditions [m]; the row is missing if it is negative.
+    margin: float  # The smallest margin of the conditions [m]. If it is negative, the row is not written.
 
 
 class _Rule:
-    """The rows of one pair of capsules by the formulas in the module's docstring, from distances of postures."""
+    """Computes the rows of one pair of capsules with the formulas in the docstring of separation_rows.py."""
 
     def __init__(self, name: str, seen: Seen, q: Array, v: Array, p: int) -> None:
         self._cell, self._seen, self._q, self._v, self._p = cell(name), seen, q, v, p
@@ -285,7 +289,7 @@ def _difference(seen: Seen, p: int, candidates: Iterable[_Candidate]) -> str:
 
 
 @pytest.mark.parametrize(("may_touch", "fast"), [(False, range(10, 17)), (True, range(15, 21))])
-def test_the_rows_of_a_pair_are_exactly_those_of_the_documented_rule(may_touch: bool, fast: range) -> None:
+def test_the_rows_of_a_pair_are_exactly_the_rows_of_the_documented_rule(may_touch: bool, fast: range) -> None:
     name = "dual_panda"
     model = behind(kernel_model_of(cell(name).robot, ControllerSettings()))
     if may_touch:
@@ -298,7 +302,7 @@ def test_the_rows_of_a_pair_are_exactly_those_of_the_documented_rule(may_touch: 
             if cell(name).bodies.box[cell(name).pairs.second[p]]:
                 continue
             if _least_free(name, q, v, seen.duration, p) < 1e-3:
-                continue  # The rows of a pair that is too close have another rule.
+                continue  # Another rule applies to a pair that is too close.
             rule = _Rule(name, seen, q, v, p)
             if difference := _difference(seen, p, rule.candidates(straight=True)):
                 differences = difference, _difference(seen, p, rule.candidates(straight=False))

@@ -16,7 +16,10 @@ from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
 def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
-    """Return the data of the certificate before it examines pairs, and h + T / 2 [s], which the bound needs."""
+    """Return the data of the certificate before it examines pairs, and h + T / 2 [s].
+
+    h is the duration of the step, and T is the duration of the stop.
+    """
     model, data = kernel_model(name).safety, reused_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
     data.candidate.q[:] = motion.q_next
@@ -37,7 +40,7 @@ def bounds_of(name: str, motion: Motion) -> Array:
 
 @kernel
 def _least_distances(model: SafetyModel, data: SafetyData, time: float, out: Array) -> None:
-    """Compute all pairs in one call, because each call from Python passes all arrays of the model again."""
+    """Compute the bounds for all pairs in one call, because each call from Python passes all arrays again."""
     for p in range(out.shape[0]):
         out[p] = least_distance(model, data, p, time)
 
@@ -114,7 +117,9 @@ def test_the_speed_bound_holds_and_is_tight_if_all_joints_stop_together(speed: f
 
 
 @pytest.mark.parametrize("shape", [TOGETHER, OWN])
-def test_the_deviation_of_a_joint_includes_the_motion_of_the_joints_that_carry_it(shape: int) -> None:
+def test_the_deviation_of_a_joint_includes_the_motions_of_the_joints_between_the_base_and_this_joint(
+    shape: int,
+) -> None:
     random, robot = np.random.default_rng(65), cell("dual_iiwa7").robot
     v, dv = random.uniform(-1, 1, 14), random.uniform(-1, 1, 14) * ACCELERATION * H
     motion = motion_of("dual_iiwa7", random_posture(robot, random), v, v + dv, shape)

@@ -30,7 +30,7 @@ def test_the_travel_of_a_step_is_the_sum_of_its_motions_in_both_directions(v: fl
 
 
 def _least(name: str, motion: Motion) -> Array:
-    """Return the least distance (p,) of each pair along the whole motion [m]; only a lower bound for a far pair."""
+    """Return the least distance (p,) of each pair along the whole motion [m], or a lower bound if the pair is far."""
     samples = np.concatenate([motion.step(), motion.stop()])
     return np.asarray(distances(cell(name), samples, exact_below=0.05).min(axis=0))
 
@@ -60,7 +60,7 @@ def _motions_from(
 
 
 def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
-    """Yield postures in which every pair is apart. With ``near``, each is just before a collision on a random path."""
+    """Yield postures in which all pairs are apart. If ``near``, they are just before a collision on a random path."""
     arrays, found = cell(name), 0
     while found < count:
         q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
@@ -98,9 +98,10 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_clearly_safe_motions_
 
 
 def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
-    """Yield motions in turn: one that comes slightly closer than the required distance, and a slower one that does not.
+    """Yield two motions for each of ``count`` starts. Both have the same start and direction.
 
-    Both have the same start and direction. ``count`` is the number of starts.
+    In the first motion, a pair comes slightly closer than the required distance. In the slower second motion, no pair
+    does.
     """
     found = 0
     for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):
@@ -348,7 +349,7 @@ def test_in_a_stop_arm_by_arm_each_arm_takes_the_time_of_its_slowest_joint(seed:
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
 def test_every_kind_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
-    """Each joint starts at, or below, the speed that condition P of joint_limits.py allows at this distance.
+    """Each joint starts at, or below, the speed that condition P of joint_limits.py allows at its distance.
 
     A slow joint that stops together with a fast joint moves for a long time, and must not drift beyond its limit.
     """

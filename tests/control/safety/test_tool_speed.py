@@ -1,4 +1,4 @@
-"""No tool is faster than its limit. Checked are the bound B of tool_speed.py, and a run with joints at full speed."""
+"""No tool is faster than its limit. The tests check the bound B of tool_speed.py, and runs of the controller."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_the_drift_bounds_the_acceleration_of_a_tool_whose_joints_keep_their_spe
     random, robot, shares = np.random.default_rng(73), cell(name).robot, []
     data = robot.model.createData()
     for _ in range(100):
-        # In many samples, few joints move before the step, and few others move after it.
+        # In many samples, few joints move before the step, and few joints move after it.
         moves = random.random((2, robot.model.nv)) < random.choice([0.05, 0.2, 0.8], (2, 1))
         v, v_next = random.uniform(-1.0, 1.0, (2, robot.model.nv)) * moves
         between = v + random.choice([0.0, 0.5, 1.0]) * (v_next - v)
@@ -104,7 +104,7 @@ def test_with_a_solver_that_drives_joints_at_full_speed_no_tool_is_too_fast_at_o
     assert contract.margins["tool_speed"].checked > 200
 
 
-def test_a_tool_moves_to_a_far_target_at_nearly_its_speed_limit_and_the_limit_holds_no_step_back(robot: Robot) -> None:
+def test_a_tool_moves_to_a_far_target_at_nearly_its_speed_limit_and_no_report_names_this_limit(robot: Robot) -> None:
     controller = limited(robot)
     contract, goal = Contract(controller), controller.tool_pose("left")
     goal.translation += [0.1, 0.2, 0.1]

@@ -119,7 +119,7 @@ class UnprintableError(Exception):
 
 
 class Panic(BaseException):
-    """An exception that is not derived from Exception, like those of libraries in Rust."""
+    """An exception that is not derived from Exception, like exceptions of libraries in Rust."""
 
 
 @pytest.mark.parametrize("error", [UnprintableError(), Panic("at the disco")], ids=["unprintable", "panic"])
@@ -157,7 +157,7 @@ def problem_of(H: Any, g: Any) -> QpProblem:
         pytest.param(problem_of(1e-20 * np.eye(NV), ZEROS), "too flat", id="too flat"),
     ],
 )
-def test_no_solver_gets_a_problem_in_which_libraries_loop_for_ever(problem: QpProblem, told: str) -> None:
+def test_no_solver_gets_a_problem_with_which_libraries_loop_for_ever(problem: QpProblem, told: str) -> None:
     guard = Guard(Raising(AssertionError("asked")), NV)
     assert guard.solve(problem).v is None
     assert re.search(told, str(guard.failure))

@@ -114,7 +114,9 @@ def test_a_stretched_arm_with_an_elbow_angle_keeps_the_contract_and_comes_to_res
         ({"angles": {"left": 0.1}, "joints": 5}, "joints = 5: allowed: three, at shoulder, elbow and wrist"),
     ],
 )
-def test_meaningless_settings_of_the_task_swivel_are_refused_by_name(settings: dict[str, object], told: str) -> None:
+def test_the_error_about_a_meaningless_setting_of_the_task_swivel_names_the_setting(
+    settings: dict[str, object], told: str
+) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks={"swivel": settings}))
 
@@ -166,7 +168,7 @@ def test_a_cost_that_is_not_finite_is_not_used() -> None:
         ({"elbow": {"gain": 1.0}}, "control.tasks.elbow.gain = 1.0: no such setting; its settings: angle"),
     ],
 )
-def test_an_unknown_task_and_a_bad_setting_are_refused_by_name(
+def test_the_error_about_an_unknown_task_or_a_bad_setting_names_it_and_says_what_is_allowed(
     look: Callable[[Robot, ControllerSettings], object], tasks: dict, message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):

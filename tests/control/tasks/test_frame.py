@@ -30,7 +30,7 @@ MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_tool_poses_and_jacobians_equal_those_of_pinocchio(name: str) -> None:
+def test_tool_poses_and_jacobians_equal_the_results_of_pinocchio(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(20)
     model, data, tools = arrays.robot.model, arrays.robot.model.createData(), tools_of(arrays.robot)
     rotation, translation, J = np.zeros((3, 3)), np.zeros(3), np.ones((6, model.nv))

@@ -115,6 +115,6 @@ def test_the_task_look_at_reduces_its_error_at_the_rate_of_its_gain_even_while_t
         ({"relative": {"wieght": 1.0}}, "relative.wieght = 1.0: no such setting; its settings: position, rpy, gain"),
     ],
 )
-def test_the_refusal_of_a_wrong_setting_says_what_is_allowed(tasks: dict[str, Any], told: str) -> None:
+def test_the_error_about_a_wrong_setting_says_what_is_allowed(tasks: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks=tasks))

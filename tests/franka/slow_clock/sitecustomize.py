@@ -1,7 +1,7 @@
 """Slow down the clocks of every Python process whose path has this folder: one second takes ``SLOWNESS`` real seconds.
 
-A busy computer then has this many times as long for each tick of a loop and for each answer. Everything else is as with
-real clocks.
+A busy computer then has ``SLOWNESS`` times as much real time for each tick of a loop and for each answer. Everything
+else is as with real clocks.
 """
 
 from __future__ import annotations

@@ -32,13 +32,13 @@ _HEIGHT = 0.45  # Height of the tools [m].
 
 @dataclass
 class Outcome:
-    """The result of a run. Distances are the least ones between bodies of different arms [m]."""
+    """The result of a run. Each distance is the least distance between bodies of different arms [m]."""
 
     speed: float  # Largest speed of both tools before the incident [m/s].
     reference: float
     measured: float
     rest: float  # Time from the incident until both measured arms rested [s].
-    margin: float  # Margin of the measured arms: distance minus the kept distance.
+    margin: float  # Margin of the measured arms: distance minus the kept distance [m].
     error: float  # Error of the measured tools before the incident [m RMS].
     events: list[str]
 

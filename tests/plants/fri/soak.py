@@ -229,7 +229,7 @@ class Soak:
 
 
 def steady(pipeline: FreezingLoop, duration: float) -> bool:
-    """Run sessions that nobody ends for ``duration`` [s], and return whether none ended."""
+    """Let sessions run for ``duration`` [s] without ending them. Return True if no session ended by itself."""
     assert isinstance(pipeline.plant, VirtualCabinets)
     cabinets = pipeline.plant.cabinets
     for cabinet in cabinets.values():

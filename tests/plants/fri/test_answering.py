@@ -1,4 +1,4 @@
-"""The process that answers the cabinets obeys the loop's commands. Each of the two notices the end of the other."""
+"""The process that answers the cabinets obeys the loop's commands. The process and the loop notice each other's end."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class BrokenOnTheWay(ArmSession):
 
 
 class Between:
-    """The process that answers cabinets. This test plays its cabinet and its loop."""
+    """The process that answers cabinets. The test takes the roles of its cabinet and of its loop."""
 
     def __init__(self, session: ArmSession) -> None:
         self.cabinet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -229,7 +229,7 @@ def test_torques_have_to_come_as_often_as_sunrise_requires() -> None:
         replace(TORQUE, period=0.003, multiplier=2)
 
 
-def test_torques_are_not_allowed_before_the_load_data_explain_the_load_of_the_arm() -> None:
+def test_torques_are_not_allowed_until_the_load_data_agree_with_the_load_of_the_arm() -> None:
     arm, client = StillArm(HOME), Client()
     arm.external_tau = (0.0, 2.1, *(0.0,) * 5)
     cabinet = Cabinet(TORQUE, arm)

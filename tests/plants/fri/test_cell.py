@@ -174,7 +174,7 @@ def test_each_tick_advances_the_reference_by_one_period_until_the_loop_knows_tha
 
 
 @pytest.mark.slow
-def test_a_command_that_came_after_its_answers_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
+def test_a_command_that_came_too_late_for_its_answers_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
     pipeline = make_loop(config, jitter=0.0005)
     plant, random, period = started(pipeline), np.random.default_rng(0), 1.0 / config.nominal_rate_hz
     withdrawn: list[bool] = []
@@ -222,7 +222,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
     plant = started(pipeline)
     sent: dict[str, list[tuple[float, Joints]]] = {arm: [] for arm in SIDES}
     plant.on_message = lambda arm, t: sent[arm].append((t, plant.cabinets[arm].commanded))
-    newest: list[Tick] = []  # The tick before the one in which the solver blocks.
+    newest: list[Tick] = []  # The tick before the tick in which the solver blocks.
     decelerations: list[np.ndarray] = []
 
     def block(tick: Tick) -> None:

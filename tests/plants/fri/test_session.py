@@ -304,7 +304,7 @@ def test_a_repeated_message_gets_the_same_answer_and_moves_nothing() -> None:
     assert heard[True] == heard[False]
 
 
-def test_if_a_cabinet_has_another_version_than_the_yaml_it_is_reported_and_gets_no_answer() -> None:
+def test_a_cabinet_whose_version_differs_from_the_version_in_the_yaml_is_reported_and_gets_no_answer() -> None:
     cabinet = Cabinet(ArmSession("left", "cabinet", version=1))
     assert cabinet.ask(MONITORING) is None
     fault = cabinet.session.state.fault(cabinet.now)

@@ -16,7 +16,7 @@ from q2r2_control.process.scheduling import schedule_thread_first
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 
-_PRIORITY = 41  # The priority is above that of the loop, because a real cabinet does not wait for the computer.
+_PRIORITY = 41  # The priority is above the loop's priority, because a real cabinet does not wait for the computer.
 _LOOKS = 0.02  # Time between two messages to an absent client, and between two checks for the end [s].
 _GONE = 1.0  # If no answer comes for this time, the client has probably ended before it read the message [s].
 
