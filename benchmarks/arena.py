@@ -3,8 +3,8 @@
     make arena  # makes a virtual environment with robosuite and runs this file there
 
 The same scripted hands give all controllers the same target poses. The hands read the true state of the simulation.
-The environment itself judges whether an episode succeeds. Contacts, distances and limits are measured in MuJoCo,
-whatever a controller reports about itself.
+The environment itself judges whether an episode succeeds. Contacts, distances and limits are measured in MuJoCo, and
+not taken from the reports of a controller.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Ask:
 
 
 class ScriptedHands:
-    """Targets that move straight from the poses of one :class:`Ask` to those of the next, at :data:`TARGET_SPEED`.
+    """Targets that move straight from the poses of one :class:`Ask` to the poses of the next, at :data:`TARGET_SPEED`.
 
     Each of the ``asks`` is computed when it is due, so it may depend on the state of the simulation at that time.
     """
@@ -105,7 +105,7 @@ class Judge:
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]
     contacts: int = 0  # Number of times that the arms began to touch each other.
-    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms. Larger distances are not measured [m].
+    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms [m]; this maximum if they were farther.
     beyond_position: float = 0.0  # Largest excess over a position limit [rad].
     velocity_ratio: float = 0.0  # Largest velocity of a joint, divided by its limit.
     _touching: bool = field(default=False, init=False)
@@ -139,7 +139,7 @@ class Judge:
         self._looks += 1
 
     def _measure(self, data: mujoco.MjData) -> None:
-        """Compute distances between the arms by Coal. MuJoCo 3.8 would return 0 for some boxes that are far apart."""
+        """Compute distances between the arms with Coal. MuJoCo 3.8 would return 0 for some boxes that are far apart."""
         apart = np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) - self._reach
         for pair in np.argsort(apart):
             if apart[pair] >= self.nearest:

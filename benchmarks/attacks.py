@@ -1,4 +1,4 @@
-"""What do attacks reach that do not come through a target: hostile solvers, wild arguments, and a loop that stalls?"""
+"""What can attacks achieve that do not use targets: hostile solvers, invalid arguments, and a loop that stalls?"""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from q2r2_control.types import SIDES, Array, CommandMode, RobotState
 from q2r2_control.verification.fault_injection import PushingSolver
 from q2r2_control.viewer.tables import figure_table
 
-_DT = 0.002  # Period of the ticks, if a row names no other one [s].
+_DT = 0.002  # Period of the ticks, unless a row of the table names another period [s].
 _TOOL_SPEED = 0.25  # The tool speed that a cell promises in one of the rows [m/s].
 _LOOP_DT = 0.004  # Period of the loop that stalls [s].
 _BALL = 0.1  # Radius of the moving body [m].
@@ -35,7 +35,7 @@ _BALL = 0.1  # Radius of the moving body [m].
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one attack reached."""
+    """One figure of an attack: the value that the attack reached, and the values that are allowed."""
 
     attack: str
     figure: str
@@ -44,7 +44,7 @@ class Row:
 
 
 class _Writer:
-    """A solver that widens the limits that it gets, where it can, and answers with the widened ones."""
+    """A solver that widens the limits in its problem if it can write them, and returns velocities beyond the limits."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         for array, change in ((problem.lower, -1.0), (problem.upper, 1.0), (problem.rows_lower, -1.0)):
@@ -137,7 +137,7 @@ class _Ball:
         return MovingObstacle(shape="sphere", size=(_BALL,), position=tuple(self._start.tolist()), speed=speed)
 
     def from_moving_bodies(self, q: Array, v: Array, t: float) -> float:
-        """Return the distance of the ball at ``t`` [s] from the nearest body of an arm that moves [m]."""
+        """Return the distance of the ball at ``t`` [s] from the nearest moving body of an arm [m]."""
         joints = [self._geometry.geometryObjects[body].parentJoint for body in self._bodies]
         moves = [
             any(abs(v[self._robot.model.joints[i].idx_v]) > 1e-3 for i in list(self._robot.model.supports[joint])[1:])

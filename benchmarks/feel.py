@@ -232,7 +232,7 @@ class _Log:
     def attenuation(self, period: float) -> float:
         """Return the RMS of the tool's motion over a ``period`` [s], divided by the RMS of the hand's motion [dB].
 
-        A steady motion of both does not count.
+        Motion at a constant velocity is subtracted from both motions first.
         """
         t, asked, tool = self._from(SETTLING_S)
         within = t < SETTLING_S + period
@@ -316,7 +316,7 @@ def tremor(band: tuple[float, float], rms: float, period: float, seed: int, spee
 def stop(speed: float, ramp: float, cruises: float) -> Way:
     """Return a motion that speeds up within ``ramp`` [s] and then moves at ``speed`` [m/s].
 
-    At the time ``cruises`` [s] it begins to stop, which takes ``ramp`` as well.
+    At the time ``cruises`` [s] it begins to stop, which also takes ``ramp`` [s].
     """
 
     def way(t: float) -> float:

@@ -238,7 +238,8 @@ def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[s
 def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
     """Find the answer to each step, as the module's docstring defines it, and return the latencies."""
     times = np.asarray(recording.sent)
-    # Ticks may be early or late, so each change of velocity is compared with its own dt, at least half the usual dt.
+    # Ticks may be early or late, so each change of velocity is divided by the real time between its two commands. This
+    # time counts as at least half of the median time, because a very short time would give a high acceleration.
     dt = np.diff(times)
     change = np.abs(np.diff(recording.v, axis=0) / acceleration_limit).max(axis=1)
     answering = np.concatenate([[False], change > _ANSWER_SHARE * np.maximum(dt, 0.5 * np.median(dt))])

@@ -1,4 +1,4 @@
-"""How long does it take from a press until the arm moves, for the first press after the nodes are ready and for others?
+"""How long does it take from a press until the arm moves, for the first press after the nodes start and for later ones?
 
 All nodes are started again for each first press. The hand always goes round a circle, so an engaged arm moves at once.
 Each tick of the arm's node ends with its flags, which the node publishes for recorders.
@@ -61,7 +61,7 @@ class PressRow:
 
     press: str  # Kind of the presses.
     count: int  # Number of presses.
-    unanswered: int  # Number of presses that nothing answered within half a second.
+    unanswered: int  # Number of presses without an answer within half a second.
     tick_p50_ms: float | None  # Longest time between two ticks of the arm's node in the half second after a press.
     tick_max_ms: float | None
     target_p50_ms: float | None  # Time from a press until the first target.

@@ -29,8 +29,8 @@ from q2r2_control.viewer.tables import record_table
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_MIN_MOTION = 1e-6  # Least difference of a command that has moved [rad].
-_MAX_LATENCY_S = 0.5  # Longest time from a jump to its command [s].
+_MIN_MOTION = 1e-6  # A command differs from an earlier command if a joint differs by more than this [rad].
+_MAX_LATENCY_S = 0.5  # The first command that differs is searched for during this time after a jump [s].
 
 # A script for the page. Its function jump moves the left controller, and returns the wall clock's time of each jump and
 # the mean time of a frame, both in [s].

@@ -61,7 +61,7 @@ class StackFigures:
     reference_distance_mm: float | None = None  # Least distance of a monitored pair at the reference's postures.
     max_acceleration_ratio: float | None = None  # Largest acceleration of the reference, divided by the joint's limit.
     max_torque_ratio: float | None = None  # Largest motor torque, divided by the limit at which the motor saturates.
-    # RMS over the last 0.5 s of the norm over the joints of the reference's acceleration [rad/s^2].
+    # RMS, over the last 0.5 s, of the norm of the accelerations of all joints in the reference [rad/s^2].
     rest_acceleration: float | None = None
     slip_mm: float = 0.0  # Largest distance by which the leash moved a target.
     pauses: list[str] = field(default_factory=list)  # Reasons why an arm was paused during the run.
