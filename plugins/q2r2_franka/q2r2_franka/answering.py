@@ -81,7 +81,7 @@ def main(commands: int, states: int) -> None:
         except Exception as error:
             with suppress(OSError):
                 from_loop.send(reason_of(error).encode())
-    # The process ends without destructors, because the library's would wait for robots that are no longer connected.
+    # The process ends without running destructors. Those of the library would wait for robots that are disconnected.
     os._exit(0)
 
 
@@ -154,7 +154,7 @@ class _Answering:
         self._tell(arm)
 
     def _write(self, arm: str, values: Array, begins: bool = False) -> None:
-        """Add ``values`` to the record: a command, or, if ``begins``, the values that the robot holds at the start."""
+        """Add ``values`` (7,) to the record: a command, or, if ``begins`` is True, the values when a motion begins."""
         newest = self._sessions[arm].state.newest
         if self._record is not None and newest is not None:
             is_torque = self._mode is CommandMode.TORQUE
@@ -166,7 +166,7 @@ class _Answering:
             self._states.send(bytes([self._arms.index(arm)]) + pickle.dumps(self._sessions[arm].state))
 
     def _lost(self, arm: str, error: Exception) -> None:
-        """Note that a robot has ended its motion, or that its connection is lost. Then brake all arms."""
+        """Store that a robot has ended its motion, or that its connection is lost. Then brake all arms."""
         link, session = self._links[arm], self._sessions[arm]
         session.end(reason_of(error))
         link.drop_motion()

@@ -124,7 +124,7 @@ class FrankaCell:
         return {arm: state.ended for arm, state in self.states.items()}
 
     def sent(self, taken: bool) -> None:
-        """Record whether the sessions have ``taken`` the commands of a tick. They refuse all if one came too late."""
+        """Store whether the sessions have ``taken`` a tick's commands. They refuse all if one command came too late."""
         self._withdraws = not taken
         if taken:
             self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
@@ -132,13 +132,13 @@ class FrankaCell:
             self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
 
     def withdraws(self) -> bool:
-        """Return whether the newest commands came too late. The arms then follow the stop after the commands before."""
+        """Return whether the newest commands came too late. The arms then follow the stop of the previous commands."""
         return self._withdraws
 
     def delay(self) -> float:
-        """Return the time from the end of a command until a tick measures the arm there [s].
+        """Return the delay of measurements [s]; see :meth:`SessionPlant.delay`.
 
-        It is 0 for torques, which act at once.
+        It is 0 in torque mode, because torques act at once.
         """
         if any(state.wanted is CommandMode.TORQUE for state in self.states.values()):
             return 0.0

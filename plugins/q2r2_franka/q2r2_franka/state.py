@@ -130,5 +130,5 @@ class ArmCommand:
     q: Joints  # Posture at the time ``end`` [rad].
     v: Joints  # Velocity at the time ``end`` [rad/s].
     deceleration: Joints  # Deceleration of the stop [rad/s^2].
-    tau: Joints | None = None  # Torques without gravity [Nm]; None with positions, or if the damping brakes.
-    damping: Joints | None = None  # Damping that brakes if no torques come [Nm s/rad]; None with positions.
+    tau: Joints | None = None  # Torques without gravity [Nm]; None in position mode, or if the damping brakes the arm.
+    damping: Joints | None = None  # Damping that brakes the arm if no torques come [Nm s/rad]; None in position mode.

@@ -35,7 +35,7 @@ class PositionStream:
     def __init__(self, q: Array) -> None:
         """Make the stream of an arm that rests at ``q`` (7,) [rad]."""
         self._path = deque([q] * MEANS, maxlen=MEANS)
-        self._means = deque([q] * 3, maxlen=3)  # Here the last three means, below the robot's last three positions.
+        self._means = deque([q] * 3, maxlen=3)  # The last three means. _sent has the robot's last three positions.
         self._sent = deque([q] * 3, maxlen=3)
         # The coefficients (6, 7) of the polynomial by which the difference between robot and path goes to zero. Its
         # variable is the time since the polynomial began [s].
