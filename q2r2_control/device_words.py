@@ -12,13 +12,15 @@ class DeviceWords:
     """Words of one device. A control without a noun is called by its name in the cell's bindings."""
 
     nouns: Mapping[str, str] = field(default_factory=dict, hash=False)  # Nouns by control.
-    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # The verb by control, if not "press" or "hold".
+    verbs: Mapping[str, str] = field(
+        default_factory=dict, hash=False
+    )  # By control, a verb other than "press" or "hold".
     # Text while no device is connected; empty if the device's own controls connect it.
     absent: str = "nothing: no input is connected"
     nobody: str = ""  # Why no person presses anything; empty if a person does.
 
     def noun(self, control: str) -> str:
-        """Return the operator's word for the name ``control``, which `` held`` or `` button`` may follow."""
+        """Return ``control`` with the operator's noun for its name, which may be followed by "held" or "button"."""
         return re.sub(r"^(\w+)( button)?", lambda found: self.nouns.get(found[1], found[0]), control)
 
     def press(self, control: str) -> str:

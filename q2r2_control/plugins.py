@@ -23,7 +23,7 @@ PLANTS = "q2r2_control.plants"
 PRESETS = "q2r2_control.presets"
 EXPORTS = "q2r2_control.exports"
 REASONS = "q2r2_control.reasons"
-# By group and name, the folders in plugins/ of packages that are not installed with this one.
+# By group and name, the folders in plugins/ of packages that are not installed with q2r2_control.
 _OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
 
 

@@ -177,7 +177,7 @@ class ObservedPicture(Protocol):
 
     @property
     def time(self) -> float:
-        """The time of its capture, by the loop's clock [s]."""
+        """The time at which the picture was captured, by the loop's clock [s]."""
 
     @property
     def pixels(self) -> npt.NDArray[np.uint8]:
@@ -190,7 +190,7 @@ class Observation:
 
     time: float  # Time of the loop's clock [s].
     state: RobotState  # Measured before the command of the tick.
-    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only of arms that measure it.
+    openings: Mapping[str, float]  # Measured openings by arm, 0 closed .. 1 open, of arms that measure them.
     tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
     # The newest picture of each camera of the cell. If a camera gives no picture, reading it raises CameraError.
     pictures: Mapping[str, ObservedPicture] = field(default_factory=dict)
@@ -203,7 +203,7 @@ class ActionChunk:
     times: Array  # (n,) Ascending times of the loop's clock [s].
     period: float  # Time from one action to the next [s]. It is also given for a single action.
     tools: Mapping[str, Array] = field(default_factory=dict)  # By arm (n, 7): x y z qx qy qz qw in the world frame.
-    # By arm (n, 6): translation [m] and rotation vector [rad], in the frame of the target before.
+    # By arm (n, 6): translation [m] and rotation vector [rad], in the frame of the previous target.
     motions: Mapping[str, Array] = field(default_factory=dict)
     grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings, 0 closed .. 1 fully open.
     postures: Array | None = None  # (n, nv) Positions of all joints, used where the tool poses leave them free [rad].
@@ -311,10 +311,10 @@ class Reference:
 class ArmTarget:
     """The target of one arm from the teleop layer."""
 
-    pose: pin.SE3 | None  # Target of the tool in the world frame; None lets the arm hold.
+    pose: pin.SE3 | None  # Target of the tool in the world frame; None if the arm has to hold its reference.
     gripper: float  # Opening, from 0 for closed to 1 for fully open.
     slip: float = 0.0  # Distance by which leash and workspace have held the target back since engaging [m].
-    slip_angle: float = 0.0  # The same for the rotation [rad].
+    slip_angle: float = 0.0  # Angle by which leash and workspace have held the target back since engaging [rad].
     offset: Array | None = None  # (3,) Measured minus commanded tool position when engaged [m]; None if not known.
     filtered_hand: Pose | None = None  # The filtered pose of the hand from which the target was computed.
     posture: Array | None = None  # (nv,) Posture that a policy wants, as far as the tool leaves it free [rad].
@@ -342,7 +342,7 @@ class ArmTiming:
     """The timing of one arm relative to the reference that it follows. All times are in seconds."""
 
     behind: float | None  # Lag that the arm's newest message reports; None if the lag is measured instead.
-    silent: float  # Time since that message.
+    silent: float  # Time since the arm's newest message.
     period: float  # Usual time between two messages.
     noise: float = 0.0  # Noise of ``behind``.
 

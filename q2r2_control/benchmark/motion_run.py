@@ -61,7 +61,7 @@ class OwnController:
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
-        """Return the same positions at rest. It is called only after a step that raised, which the contract forbids."""
+        """Return the same positions at rest. This is called only after an exception, which our contract forbids."""
         reference = self._controller.step({}, _SHORTEST_DT)
         return reference.q, np.zeros_like(reference.v)
 
@@ -104,14 +104,14 @@ class MotionFigures:
     done: float  # Share of the motion's ticks that were run; less than 1 if the controller was too slow.
     ticks: int = 0  # Measured ticks.
     failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
-    # Errors are distances between the tools and their targets. The first two do not count the rest at the end.
+    # Errors are distances between tools and targets. rms_error_mm and max_error_mm do not count the rest at the end.
     rms_error_mm: float | None = None  # RMS error of the tool whose RMS error is larger.
     max_error_mm: float | None = None  # Largest error of either tool.
     end_error_mm: float | None = None  # Error in the last tick, of the tool whose error is larger.
     # Time from the beginning of the motion until both tools stay within 10 mm of the goal. None if they do not stay
     # there until the end, or if the motion has no goal.
     arrival_s: float | None = None
-    fallback_percent: float | None = None  # Share of ticks with the certified stop; None for a peer, which has none.
+    fallback_percent: float | None = None  # Percentage of ticks with a certified stop; None for a peer.
     min_distance_mm: float | None = None  # Least distance of the monitored pairs, computed by Coal.
     closest_pair: tuple[str, str] | None = None
     max_acceleration: float | None = None  # Largest acceleration of a joint [rad/s^2].

@@ -5,7 +5,7 @@ every controller can get the same targets. Each motion begins with an approach f
 for :data:`REST`. Tools point straight down and keep this rotation, unless the motion says otherwise.
 
 If both tools point down at equal heights, 0.18 m apart, the wrists are 20 mm apart. A tool that points down can reach
-0.73 m from its arm's mount, at a height of 0.38 m above the mount. If its tool points down, no arm reaches the home
+0.73 m from its arm's mount, at a height of 0.38 m above the mount. An arm whose tool points down cannot reach the home
 position of the other arm's tool.
 """
 
@@ -46,7 +46,7 @@ class WorkMotion:
     approach: tuple[Array, ...] = ()
     # The angle by which each tool turns about the world's x axis during the approach [rad]. It keeps this angle.
     tilt: tuple[float, float] = (0.0, 0.0)
-    has_goal: bool = False  # Whether the purpose is to arrive at the last targets.
+    has_goal: bool = False  # Whether both tools have to arrive at the last targets.
     reachable: bool = True  # Whether both arms can reach all targets with every distance kept.
     rest: float = REST  # Duration of the constant targets at the end [s].
 

@@ -154,9 +154,10 @@ def _plant_faults(config: Config, robot: Robot) -> list[str]:
 
 
 def _notes_on_models(config: Config, in_degrees: Collection[str]) -> list[str]:
-    """Return the notes of the models that a user should read.
+    """Return the notes that a user should read about the models.
 
-    The joints ``in_degrees``, which have their names in the cell, are named by a fault and are not asked for units.
+    ``in_degrees`` are names of joints in the cell. A fault already says that their limits are in degrees. Therefore
+    notes that ask for the unit of these joints are left out.
     """
     if config.robot is not None:
         models = [("robot", "", load_model(config.robot, config.packages, "robot"))]

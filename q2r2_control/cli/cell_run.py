@@ -159,7 +159,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 
 
 def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManager[CameraStreams | None]:
-    """Open all real cameras if pictures are recorded, shown or given to the input; otherwise return None for them."""
+    """Open all real cameras if pictures are recorded, shown or given to the input; otherwise the context gives None."""
     source = load_class(INPUTS, options.input)
     sees = any(hasattr(source, method) for method in (_SHOWS_PICTURES, PolicySource.observe.__name__))
     used = not options.fast and (options.record is not None or options.page is not None or sees)
@@ -196,7 +196,9 @@ def _run_cell(
     try:
         plant = make_plant(options.plant, robot, config)
     except PlantError as error:
-        if options.plant != "mujoco":  # The message below is that of q2r2 check, which checks only the simulation.
+        if (
+            options.plant != "mujoco"
+        ):  # q2r2 check builds only the simulation, so only its errors get the words of q2r2 check.
             raise
         raise PlantError(f"{config.name}: FAULT plant {options.plant}: {error}") from error
     if isinstance(plant, WaitingPlant):

@@ -166,8 +166,8 @@ def fri_cabinet(
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
         client = clients[str(arm)] = address_for(its.address) or "127.0.0.1", its.port
-        # A cabinet of KUKA sends from the same port as its client has. At one address, this is not possible, so the
-        # simulated cabinet gets any free port there.
+        # A cabinet of KUKA uses the same port number as its client. If both have the same address, they cannot share a
+        # port, so the simulated cabinet gets any free port.
         port = 0 if its.address == client[0] else its.port
         origins[str(arm)] = its.address, port if source_port is None else source_port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}

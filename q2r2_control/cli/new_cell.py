@@ -98,8 +98,8 @@ def new_cell(
 ) -> None:
     """Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, accelerations.
 
-    Exit 1 where q2r2 check still finds faults in it, which are listed. Answers are kept in new-cell.answers.json until
-    it finds none, so that the next try offers them.
+    Exit code 1 if q2r2 check still finds faults in the cell, which are listed. Answers are kept in
+    new-cell.answers.json until there are no faults, so that the next try offers them.
     """
     file, srdf = Path(f"{name}.yaml"), Path(f"{name}.srdf")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
@@ -286,7 +286,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance
-    near_by_construction = []  # Pairs within an arm, and of an arm with a part of its robot that stands still.
+    near_by_construction = []  # Pairs of two links of one arm, and pairs in which one link moves and one stands still.
     for pair in pair_names(robot.collision_model):
         links = link_of(pair[0]), link_of(pair[1])
         one, other = (robot.roles[link].arms for link in links)

@@ -188,7 +188,7 @@ class TaskWatch:
                 judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """Return the results of all tasks. All tasks fail if an arm touched anything but a part with its fingers."""
+        """Return the results of all tasks. All of them fail if an arm touched anything except parts in its fingers."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():

@@ -59,11 +59,11 @@ class PegJudge(Judge):
     """A part stands straight at the bottom of the hole of another part, without a finger on it, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
-        """``parts`` has the height of the peg and then that of the hole's bottom, by name of the part [m]."""
+        """``parts`` has, by name of a part, the height of the peg and then the height of the hole's bottom [m]."""
         super().__init__(*parts)
         self._rest = 0.5 * sum(parts.values())  # Vertical distance of the centres when the peg is at the bottom [m].
-        # The time for which the peg has stood in the hole [s]; its distance from the hole's middle, and above its place
-        # at the bottom [m]; the larger tilt of both parts [rad].
+        # The time for which the peg has stood in the hole [s]; its distance from the hole's middle, and its height
+        # above its lowest position [m]; the larger tilt of both parts [rad].
         self._stood = self._beside = self._above = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:

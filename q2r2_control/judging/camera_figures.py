@@ -26,9 +26,9 @@ _ODD, _ODD_RATIO = 10.0, 3.0
 # parts, pixel rows of each part, columns of parts, pixel columns of each part.
 _PARTS = (4, 6, 4, 8)
 # Damaged parts are searched for only if the camera's rate is at least this [Hz]. At a lower rate, a moving body may be
-# in a part in one picture only. The part would then wrongly count as damaged.
+# visible in a part of only one picture. This part would then wrongly count as damaged.
 _QUICK = 10.0
-LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
+LARGEST_LAG = 0.4  # The largest lag, of either sign, that is compared [s].
 _LAG_STEP = 0.02  # The step between two lags that are compared [s].
 _IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].
 # A larger lag is chosen only if two conditions hold. The first condition: the share of the pictures' motion that the
@@ -39,7 +39,7 @@ _CLEARLY = 0.05
 _UNEXPLAINED = 0.65
 _LEAST_FIT = 0.35  # Least share of the pictures' motion that the arms' motion must explain, or else the lag is unknown.
 _FEWEST = 20  # With fewer pictures, no lag is computed and no swap of cameras is found.
-# A camera on an arm is compared with fixed cameras if the joints of its arm travel more than this in all [rad].
+# A camera on an arm is compared with fixed cameras if the joints of its arm travel more than this in the episode [rad].
 _LEAST_TRAVEL = 0.5
 # Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's arm.
 _CORRELATES = 0.4  # Each camera's correlation with the other camera's arm must be larger than this.

@@ -102,7 +102,7 @@ class About:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Facts that a run states at its end. The recording of a run that was killed has none."""
+    """Facts that a run states at its end. If a run was killed, its recording has no conclusion."""
 
     success: bool | None = None  # The result of the task's own check; None if there was no check.
     ended_by: str | None = None  # The fault that ended the run; None if no fault did.

@@ -50,7 +50,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._types: dict[int, str] = {}  # By the id of a schema, the message type.
-        self._topics: dict[int, Topic] = {}  # By the id of a channel.
+        self._topics: dict[int, Topic] = {}  # By the id of a channel, its topic.
         self._skipped: list[_Place] = []  # Chunks that were not read and may declare channels.
 
     def topics(self) -> dict[int, Topic]:

@@ -1,8 +1,8 @@
 """Topics of recordings and their messages: ROS 2 messages in CDR, made by rosbags.
 
 A recording contains the run of one loop, or messages of the ROS nodes. The data of a loop's run is on the topics
-``tick``, ``hand_samples`` and ``state``, and on those of the pictures. The replay, the judge and the export read these
-topics. The other topics repeat this data as standard messages, which plotting tools and viewers can show.
+``tick``, ``hand_samples`` and ``state``, and on the topics of the pictures. The replay, the judge and the export read
+these topics. The other topics repeat this data as standard messages, which plotting tools and viewers can show.
 """
 
 from __future__ import annotations
@@ -200,8 +200,8 @@ def is_reliable(topic: Topic) -> bool:
 class Message(NamedTuple):
     channel: int
     number: int  # The number of the message's tick, or the sequence number that the sender gave the message.
-    time: int  # The Unix time at which it was received, or of the tick to which it belongs [ns].
-    sent: int  # The Unix time at which it was sent, by the sender's clock [ns].
+    time: int  # The Unix time of the message's receipt, or of the tick to which it belongs [ns].
+    sent: int  # The Unix time at which the message was sent, by the sender's clock [ns].
     payload: bytes  # The message in CDR.
 
     @property

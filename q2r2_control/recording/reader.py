@@ -50,7 +50,7 @@ BROKEN = (
 class Picture:
     # The Unix time at which the picture was captured, or was received if a ROS node sent it [ns].
     time: int
-    tick: int  # The number of the newest tick at that time. In a recording of ROS nodes, it is a sequence number.
+    tick: int  # The number of the newest tick at ``time``. In a recording of ROS nodes, it is a sequence number.
     jpeg: bytes  # The picture as a JPEG file; a picture of depth is a PNG file with 16 bits for each pixel.
 
 
@@ -252,7 +252,7 @@ class EpisodeSpan:
     start: float = -math.inf
     end: float = math.inf  # inf stands for the end of the run.
     discarded: bool = False  # True if the operator discarded the episode.
-    success: bool | None = None  # None if it is not known.
+    success: bool | None = None  # True if the episode succeeded; None if that is not known.
     number: int = 0  # The number of the episode, from 1 on; 0 is the whole run.
     # Times at which the operator began another subtask [s]. The first subtask begins with the episode.
     subtask_starts: tuple[float, ...] = ()

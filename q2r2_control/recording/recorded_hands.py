@@ -62,7 +62,8 @@ class RecordedHands:
         self._samples: list[tuple[float, list[HandSample]]] = []  # The ticks with samples: their times and samples.
         self._changes: list[tuple[float, bool]] = []  # Times from which the hands were connected, or were not.
         ticks = RecordedTicks(recording)
-        self._begins = ticks.next.now if ticks.next is not None else ticks.start.now  # By the recorded clock.
+        # The time of the first tick, or of the start if there is no tick, by the recorded clock [s].
+        self._begins = ticks.next.now if ticks.next is not None else ticks.start.now
         while ticks.next is not None:
             tick = ticks.advance()
             self._ends = tick.now - self._begins

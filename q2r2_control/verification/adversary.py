@@ -25,7 +25,7 @@ class Request(NamedTuple):
 # A function of the tick within the segment and of the last reference's joint positions (nv,), which returns a request.
 Stream = Callable[[int, Array], Request]
 _TABLE = 0.2  # Height of the table's top, on which tools press, as in the shipped cells [m].
-_TICK = 0.001  # Time by which a work motion at its usual speed goes on in a tick [s].
+_TICK = 0.001  # In each tick, a work motion at its usual speed goes on by this time [s].
 # A gain changes to its first value times one of these factors. A small separation gain slows the arms long before
 # contact, which tests little.
 _GAIN_SHARES = {
@@ -263,7 +263,7 @@ class HostileChanges:
         return str(self._grasps.choice(self._with_object)), bool(self._grasps.random() < 0.7)
 
     def settings(self) -> dict[str, float] | None:
-        """Return a new value of one setting by its name, or None for no change: another distance or another gain."""
+        """Return the name and the new value of one setting, a distance or a gain; None for no change."""
         random = self._changes
         if random.random() > 0.01:
             return None

@@ -191,7 +191,7 @@ class Contract:
         self.ticks += 1
 
     def tail_acceleration(self, duration: float = 0.5) -> float:
-        """Return the norm over the joints of the RMS acceleration over the last ``duration`` [s], in rad/s^2."""
+        """Return the RMS, over the last ``duration`` [s], of the norm of all joints' accelerations [rad/s^2]."""
         total, time = 0.0, 0.0
         for h, square in reversed(self._newest):
             total, time = total + square, time + h

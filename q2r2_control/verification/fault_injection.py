@@ -274,7 +274,8 @@ class Starts:
         return q
 
 
-# Pairs that may touch: with TABLE_ONLY, fingers and the table; with FINGERS, also fingers of both hands.
+# Pairs that may touch. With TABLE_ONLY, fingers may touch the table. With FINGERS, they may also touch the other arm's
+# fingers.
 TABLE_ONLY = (ContactPair(pair=("*_finger_*", "table")),)
 FINGERS = (*TABLE_ONLY, ContactPair(pair=("left_*_finger_*", "right_*_finger_*"), depth=0.005))
 

@@ -108,7 +108,7 @@ def run_soak(
     """
     robot = Robot.from_config(config)
     settings = config.control.timed(realtime=True)
-    # The solver gets no time limit, because a soak that finds a fault has to find it again.
+    # The solver gets no time limit, so that a soak with the same seed finds the same faults again on any computer.
     simulated = config.control.timed(realtime=False)
     inner = solver_of(simulated, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
     name = config.control.solver if solver is None else type(solver).__name__
@@ -249,9 +249,9 @@ def steady_growth(memory: Sequence[float | None]) -> float | None:
 
 
 def _memory_mb() -> float | None:
-    """Return the memory of this process after garbage collection, without files [MB]; None if it is not known.
+    """Return the memory of this process after garbage collection, without pages of files [MB]; None if unknown.
 
-    Files are left out, because pages of a library become resident at the first call of a function, at any time.
+    Pages of files are left out, because pages of a library become resident when a function is first called.
     """
     gc.collect()
     try:
