@@ -94,7 +94,7 @@ def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
 
 
 def play(cell: Cell, seed: int) -> Episode:
-    """Play one episode until it succeeds, the hands are done, or :data:`MAX_EPISODE_S` is over."""
+    """Play one episode until the task succeeds, the hands have no more targets, or :data:`MAX_EPISODE_S` is over."""
     cell.reset(seed)
     hands = ScriptedHands(cell.asks(), cell.tools())
     after, steps = None, 0

@@ -1,4 +1,4 @@
-"""Scripted hands of the arena, and a judge that measures in MuJoCo, whichever controller moves the arms."""
+"""Scripted hands of the arena, and a judge that measures the arms of every controller in the same way, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ class Ask:
 class ScriptedHands:
     """Targets that move straight from the poses of one :class:`Ask` to the poses of the next, at :data:`TARGET_SPEED`.
 
-    Each of the ``asks`` is computed when it is due, so it may depend on the state of the simulation at that time.
+    The hands take the next of the ``asks`` only when they need it. Therefore an item may be computed from the state of
+    the simulation at that time.
     """
 
     def __init__(self, asks: Iterator[Ask], tools: Mapping[str, pin.SE3]) -> None:

@@ -126,7 +126,7 @@ class RobosuiteCell:
         return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)
 
     def asks(self) -> Iterator[Ask]:
-        """Yield the target poses and gripper states of the hands, which are computed when they are due."""
+        """Yield the target poses and gripper states of the hands. Each item is computed when the hands need it."""
         return self._lift() if self._task == "TwoArmLift" else self._handover()
 
     def _lift(self) -> Iterator[Ask]:

@@ -152,7 +152,7 @@ class _Ball:
 
 
 def stalls(robot: Robot, settings: Any, config: Any) -> Iterator[Row]:
-    """Report a ball once. It then flies to a swinging arm, while the loop stalls in one of 40 ticks."""
+    """Report a moving ball only once. The ball flies to a swinging arm, while the loop stalls in one of 40 ticks."""
     controller = CartesianController(robot, settings.model_copy(update={"moving_obstacles": ("hand",)}))
     drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
     loop = ControlLoop(controller, drive, _LOOP_DT, StreamSettings(), watch, owns_plant=True)

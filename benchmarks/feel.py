@@ -3,9 +3,9 @@
 A scripted hand oscillates at single frequencies, reaches, trembles, rests, and moves and stops. The tool is measured
 through the whole chain: samples at a headset's rate, teleoperation, the controller, and an arm in MuJoCo. A tone is a
 sine motion of one frequency. Its delay and gain come from least-squares fits of a sine and a cosine to the paths of
-hand and tool. Real hands do not move in tones, so reaches are measured, too. The delay of a reach is the delay at which
-the velocities of hand and tool have their highest correlation. The figures for a tremor within a band count all motion
-of the tool, also outside the band.
+hand and tool. Real hands do not move in tones, so reaching motions (reaches) are measured, too. The delay of a reach is
+the delay at which the velocities of hand and tool have their highest correlation. The figures for a tremor within a
+band count all motion of the tool, also outside the band.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True)
 class FeelFigures:
-    """The figures of one filter. Delays are from the hand to the measured tool."""
+    """The figures of one filter. Delays and gains are those of the measured tool relative to the hand."""
 
     name: str
     filter_delay_ms: float  # Delay of the filter alone, from its settings.
@@ -200,7 +200,7 @@ class _Log:
         self._tool.append(tick.tools[ARM].translation.copy())
 
     def reaches(self, lasts: float) -> bool:
-        """Return whether the run lasted for ``lasts`` [s]."""
+        """Return whether the run lasted at least ``lasts`` [s]."""
         return bool(self._t) and self._t[-1] > lasts - _LONGEST_TICK_S
 
     def tone(self, frequency: float) -> tuple[float, float]:

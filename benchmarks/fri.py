@@ -1,4 +1,4 @@
-"""How fast are KUKA's cabinets answered, and how well do the arms follow through them?"""
+"""How fast do KUKA's cabinets get their answers, and how well do the arms behind the cabinets follow?"""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def stand_stills(processor: int) -> list[tuple[float, float]]:
 
 
 def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
-    """Return the number of late answers that were delayed by a standstill, or by an earlier answer that is counted.
+    """Return the number of late answers that were delayed by a standstill, or by an earlier answer that was so delayed.
 
     Both lists have pairs of a start and an end [s].
     """
@@ -102,7 +102,7 @@ class ToolWay:
                 self._tools.extend(tick.tools[arm].translation)
 
     def errors(self, delays: range) -> list[float]:
-        """Return the error for each of the ``delays`` [ticks] of the tools behind their reference [mm RMS].
+        """Return the error [mm RMS] for each assumed delay of the tools behind their reference, in ``delays`` [ticks].
 
         Only ticks with a new measurement count.
         """

@@ -1,4 +1,4 @@
-"""How many steps per second do our environments make, and robosuite's two-arm environments with the same arms?
+"""How many steps per second do our environments and robosuite's two-arm environments make, with the same arms?
 
     make arena  # makes a virtual environment with robosuite and runs this file there
 

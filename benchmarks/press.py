@@ -43,7 +43,7 @@ _APPROACH_SPEED = 0.5  # Speed of the target, far above the speed that contact a
 # Times when the tool goes down, slides and is lifted, and when the run ends [s].
 _DOWN_BEGINS_S, _SLIDE_BEGINS_S, _LIFT_BEGINS_S, _RUN_ENDS_S = 2.5, 6.0, 8.5, 10.5
 _APPROACH_S, _SLIDE_S = 2.0, 1.5  # Durations of the approach and of the slide [s].
-_SETTLING_S = 1.0  # Time after the start of a part until its force is steady [s].
+_SETTLING_S = 1.0  # Time from the start of a press until its force is steady [s].
 NOTES = (
     "impact: Speed of the tool at the first touch [m/s], and largest force within the next 0.25 s [N].",
     "steady: Mean force while the tool stays [N].",

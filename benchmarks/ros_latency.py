@@ -39,7 +39,7 @@ _SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_c
 
 
 # A command with more than this share of the acceleration limit is an answer. A step causes an acceleration at the whole
-# limit. The rest of the motion that the step before has caused needs only a tenth of the limit by then.
+# limit. At that time, the motion that the previous step has caused needs only a tenth of the limit.
 _ANSWER_SHARE = 0.4
 
 
@@ -55,7 +55,7 @@ class CommandRecording:
 
 @dataclass(frozen=True, slots=True)
 class LatencyRow:
-    """The latencies of one input, from the step until the command was received. They are None without any answer."""
+    """The latencies of one input, from the step until the command was received. None if no step was answered."""
 
     path: str  # Names of the first and the last topic.
     steps: int  # Number of steps.

@@ -1,7 +1,7 @@
 """How long does it take from a press until the arm moves, for the first press after the nodes start and for later ones?
 
 All nodes are started again for each first press. The hand always goes round a circle, so an engaged arm moves at once.
-Each tick of the arm's node ends with its flags, which the node publishes for recorders.
+At the end of each tick, the arm's node publishes its flags for recorders, so these messages show when its ticks end.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class PressRow:
     tick_max_ms: float | None
     target_p50_ms: float | None  # Time from a press until the first target.
     target_max_ms: float | None
-    motion_p50_ms: float | None  # Time from a press until the first joint command that moves.
+    motion_p50_ms: float | None  # Time from a press until the first joint command of a motion.
     motion_max_ms: float | None
 
 

@@ -194,7 +194,7 @@ class Q2R2Cell(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Send an action. An action that does not come from the hands comes from the policy.
 
-        With such an action, the policy takes over the arms if the hands had them.
+        If the hands moved the arms until now, such an action lets the policy take over the arms.
         """
         self._check()
         before, self._by_policy = self._by_policy, not self._asked

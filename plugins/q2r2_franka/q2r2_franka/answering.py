@@ -162,7 +162,7 @@ class _Answering:
             write_entry(self._record, entry)
 
     def _tell(self, arm: str) -> None:
-        with suppress(OSError):  # If the loop reads nothing, the socket is full. The loop gets a later state.
+        with suppress(OSError):  # The socket is full if the loop reads too slowly. This state is then dropped.
             self._states.send(bytes([self._arms.index(arm)]) + pickle.dumps(self._sessions[arm].state))
 
     def _lost(self, arm: str, error: Exception) -> None:
@@ -177,7 +177,7 @@ class _Answering:
     def _lose(self, arm: str) -> None:
         """Drop a lost connection. The last state stays, because the loop needs a state at every tick.
 
-        Its mode becomes ABSENT.
+        The mode in this state becomes ABSENT.
         """
         self._links[arm].lose()
         if (newest := self._sessions[arm].state.newest) is not None:
@@ -213,7 +213,7 @@ class _Answering:
         return False
 
     def _finish(self) -> None:
-        """End the motions of all arms, which are at rest. Afterwards their robots hold them."""
+        """End the motions of all arms, which are at rest. Afterwards each robot holds its arm by itself."""
         for arm, session in self._sessions.items():
             if session.state.controlled:
                 try:
@@ -234,7 +234,7 @@ class _Answering:
             for arm, link in self._links.items():
                 session = self._sessions[arm]
                 if link.is_open and session.state.is_silent(now) and not select.select([link.file], (), (), 0)[0]:
-                    self._lose(arm)  # The robot's control has no power or no network any more.
+                    self._lose(arm)  # The robot is silent, so its control has lost its power or its network.
                 if not link.is_open:
                     link.open()
                     session.hear(link.read(), time.monotonic())

@@ -1,7 +1,7 @@
 """Turn the ticks of the loop into commands for the sessions of all arms.
 
-**The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, one
-millisecond of it passes, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
+**The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, this time
+advances by 1 ms, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
 the loop extends the reference so far that no robot reaches the end of the reference before the next tick has come,
 unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the
 robots get the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first.
@@ -46,7 +46,7 @@ class FrankaCell:
             robot: The robot.
             states: The state of each arm's session.
             period: Period of the loop [s].
-            longest: The longest step of the reference in one tick [s]. A step has one acceleration.
+            longest: The longest step of the reference in one tick [s]. The acceleration is constant within a step.
         """
         self.states = {state.arm: state for state in states}
         self._robot, self._period, self._longest = robot, period, longest
@@ -64,8 +64,8 @@ class FrankaCell:
     def due(self, now: float) -> tuple[float, float]:
         """Return two durations of the reference's motion in the tick at ``now`` [s].
 
-        During the first time, the reference follows the earlier certified stop; it may be 0. During the second time, it
-        moves on.
+        During the first one, which may be 0, the reference follows the certified stop of an earlier tick. During the
+        second one, it makes the motion of this tick.
         """
         following = [state for state in self.states.values() if state.following]
         late = now - self._now if following else 0.0

@@ -15,8 +15,9 @@ from q2r2_franka.stream import PositionStream, TorqueStream
 
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _STILL = 0.02  # In torque mode, an arm counts as resting if all joints are slower than this [rad/s].
-# An arm may begin to follow a reference if each joint is nearer to it than this [rad]. The first number is for position
-# mode, in which the position that the arm holds counts. The second is for torque mode, with the measured position.
+# An arm may begin to follow a reference if each joint is nearer to it than this [rad]. In position mode, the positions
+# that the robot holds have to be within the first number. In torque mode, the measured positions have to be within the
+# second number.
 _SAME, _NEAR = 1e-6, 0.02
 # No joint has a greater acceleration in the first tick after rest [rad/s^2]. If a joint of the reference is faster than
 # this acceleration allows after one tick, the reference was not at rest one tick ago.
