@@ -103,7 +103,7 @@ class HandFault(StrEnum):
 
     FROZEN = "hand_frozen"
     FRAME_MOVED = "hand_frame_moved"  # Both hands moved as one, so that their frame has probably moved.
-    UNTRACKED = "hand_untracked"  # The headset reports no pose, or says that it is a guess.
+    UNTRACKED = "hand_untracked"  # The headset reports no pose, or reports that its pose is a guess.
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ class Command:
     """A command for the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
-    q: Array  # (nv,) Joint positions [rad]. In velocity and torque mode, the reference, for plants that show it.
+    q: Array  # (nv,) Joint positions [rad]. In other modes, they are the reference, which plants may show.
     v: Array  # (nv,) Joint velocities [rad/s].
     tau: Array  # (nv,) The commanded joint torques in torque mode [Nm].
     grippers: dict[str, float]  # Openings by arm, from 0 for closed to 1 for fully open.

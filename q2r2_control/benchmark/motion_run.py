@@ -1,8 +1,8 @@
 """Run one controller in one work motion and compute its figures, or run our controller and its peers in all motions.
 
 All controllers run in one process, and get the same cell, limits, targets and ticks. Peers run open loop, as our
-controller does. A peer gets its targets earlier by its lag. Our controller also runs in free air, where no pairs are
-monitored. The difference between its two runs is the cost of the monitored pairs.
+controller does. Each peer lags behind its targets, so it gets them earlier by this lag. Our controller also runs in
+free air, where no pairs are monitored. The difference between its two runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ class MotionFigures:
     motion: str
     controller: str
     done: float  # Share of the motion's ticks that were run; less than 1 if the controller was too slow.
-    ticks: int = 0  # Measured ticks.
-    failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
+    ticks: int = 0  # Number of measured ticks.
+    failures: int = 0  # Number of measured ticks with an exception, no solution, or numbers that are not finite.
     # Errors are distances between tools and targets. rms_error_mm and max_error_mm do not count the rest at the end.
     rms_error_mm: float | None = None  # RMS error of the tool whose RMS error is larger.
     max_error_mm: float | None = None  # Largest error of either tool.
@@ -220,7 +220,7 @@ def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tup
 
 
 def arrival_time(to_goal: Array, dt: float) -> float | None:
-    """Return the time after which both tools stay at their goals [s]; None if one is away from its goal at the end.
+    """Return the time after which both tools stay at their goals [s]; None if a tool is not there at the end.
 
     ``to_goal`` (n, arms) are their distances from the goals in ticks of ``dt`` [s].
     """

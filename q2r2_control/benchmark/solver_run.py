@@ -30,7 +30,7 @@ class SolverFigures:
     """The figures of one solver in the motion."""
 
     solver: str
-    unsolved_percent: float  # Share of ticks with an unsolved QP.
+    unsolved_percent: float  # Percentage of ticks with an unsolved QP.
     # Largest distance, in any tick, between a tool's positions with this solver and with DAQP; None without ticks.
     off_daqp_mm: float | None
     motion: MotionFigures

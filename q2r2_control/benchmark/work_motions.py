@@ -173,7 +173,7 @@ def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
 
 
 def _between_tools(home: Array, gap: float) -> Array:
-    """Return the ``home`` positions of both tools (2, 3) [m], moved sideways to ``gap`` [m] around the middle."""
+    """Return the ``home`` positions of both tools (2, 3) [m], moved sideways until they are ``gap`` [m] apart."""
     return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
@@ -223,7 +223,7 @@ _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 
 
 def _slide(t: float, home: Array) -> Array:
-    """Return a left target that slides sideways over the table, and a right target that rests away from it (2, 3)."""
+    """Return a left target that slides sideways over the table, and a right target at rest beside its path (2, 3)."""
     y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_LENGTH, _SLIDE_SPEED, _SLIDE_RAMP)
     return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 

@@ -1,4 +1,4 @@
-"""The ``q2r2`` command, with everything that its subcommands share. The module ``commands`` has their table."""
+"""The ``q2r2`` command, with everything that its subcommands share. The module ``commands`` lists the subcommands."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
-# Time between two judgements of tasks [s]. At this rate, they do not make a cabinet late.
+# Time between two judgements of tasks [s]. Judgements at this rate do not make a cabinet late.
 _JUDGED_EVERY = 0.005
 # The lines that the cabinets print: time between two readings [s], and the largest size of all lines [bytes].
 _LOOKS, _LONGEST_LINES = 0.05, 1 << 16

@@ -64,7 +64,7 @@ class _Draft:
     xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments that every xacro model gets, by name.
 
     def part(self, model: str) -> dict[str, Any]:
-        """Return the data of a model's block in the YAML. Its mount is at the world's origin until it is known."""
+        """Return the data of a model's block in the YAML. The model's mount is the world's origin until it is known."""
         args = {"xacro_args": self.xacro_args} if self.xacro_args and model.endswith(".xacro") else {}
         return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
@@ -130,7 +130,7 @@ def new_cell(
         cell = Robot.from_config(found)
         _limit_acceleration(draft, cell, found)
         approaches = nearest_approaches(cell, samples, 0, CLEARANCE, progress)
-    # A pair of links with several shapes is left out only if no pair of their shapes is watched.
+    # An overlapping pair of links gets into the SRDF only if none of their shapes form a monitored pair.
     watched = {frozenset(map(link_of, pair)) for pair in pair_names(cell.collision_model)}
     overlapping = ((link_of(a), link_of(b)) for a, b in cell.ignored_pairs)
     always = dict.fromkeys([*draft.always, *(links for links in overlapping if frozenset(links) not in watched)])
@@ -286,7 +286,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance
-    near_by_construction = []  # Pairs of two links of one arm, and pairs in which one link moves and one stands still.
+    near_by_construction = []  # Pairs of links of one arm, and pairs with a fixed link other than the floor.
     for pair in pair_names(robot.collision_model):
         links = link_of(pair[0]), link_of(pair[1])
         one, other = (robot.roles[link].arms for link in links)

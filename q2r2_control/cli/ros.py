@@ -98,7 +98,7 @@ def watch(
 ) -> None:
     """Show nodes, topics, rates and ages of a running set, the state of each arm, and why it does not move.
 
-    The command only listens, and not to commands, so that it does not influence the set. If stderr is not a terminal,
+    The command only listens, and ignores commands, so that it does not influence the set. If stderr is not a terminal,
     it prints a line whenever the state of an arm changes. Exit code 1 if no node of a set was heard.
     """
     cell = load_config(config)

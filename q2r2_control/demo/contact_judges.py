@@ -9,8 +9,8 @@ from q2r2_control.demo.part_judges import FINGERS, HELD_TIME, Judge, PartState, 
 
 _FORCE = (5.0, 15.0)  # The least and the largest force with which the part has to press on the table [N].
 _MEAN_TIME = 0.05  # The time constant of the mean force [s].
-# Least length of the path with that force [m]. Largest length of the path with another force, as a share of the first
-# length.
+# Least length of the path on which the part presses with such a force [m]. Largest length of the path on which it
+# presses with another force, as a share of the length with such a force.
 _WIPED, _ASTRAY = 0.3, 0.1
 _DEEP, _BESIDE = 0.003, 0.001  # The peg's largest distance from the bottom of the hole, and from the hole's middle [m].
 _STRAIGHT = math.radians(3.0)  # The largest tilt of the peg and of the part with the hole [rad].
@@ -21,7 +21,8 @@ class WipeJudge(Judge):
 
     def __init__(self, part: str) -> None:
         super().__init__(part)
-        self._place: tuple[float, float] | None = None  # Last position, if held and on the table [m].
+        # The part's last position [m]; None if fingers did not hold the part, or if it was not on the table.
+        self._place: tuple[float, float] | None = None
         # The mean force and its largest value so far [N]; the path with the wanted force and with another force [m].
         self._force = self._most = self._wiped = self._astray = 0.0
 

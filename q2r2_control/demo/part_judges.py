@@ -92,7 +92,7 @@ class TouchWatch:
         }
 
     def _kind(self, body: int, robot: Robot) -> int:
-        """Return the flag of a body that is not a part. The nearest joint between body and world decides."""
+        """Return the flag of a body that is not a part. It depends on the robot's joint by which the body is moved."""
         above = body
         while above:
             for arm, finger in _FINGERS_OF.items():

@@ -73,7 +73,7 @@ class EpisodeVectors:
     ahead: int = 0
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
-    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same for cameras with recorded depth.
+    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # Depth, if it is recorded.
     subtasks: tuple[str, ...] = ()  # The names of the episode's subtasks, in their order; empty if it has none.
     subtask: tuple[int, ...] = ()  # For each frame, the index of its subtask in ``subtasks``; empty without subtasks.
 

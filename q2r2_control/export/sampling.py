@@ -52,8 +52,8 @@ _OLDEST = 2
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
     """Return the observations and commands at each of n frames of the ``span``, by name.
 
-    The time t_0 is that of the first tick in the ``span``. With ``trim``, it is that of the first tick at which an arm
-    is engaged or the reference moves, and frames end with the last such tick. The result contains:
+    The time t_0 is the time of the first tick in the ``span``. If ``trim`` is True, it is the time of the first tick at
+    which an arm is engaged or the reference moves, and the frames end with the last such tick. The result contains:
 
     - ``position``, ``velocity``, ``effort`` (n, joints): measured numbers [rad, rad/s, Nm].
     - ``opening`` (n, arms): measured openings of grippers, 0 closed .. 1 open; -inf if not measured.

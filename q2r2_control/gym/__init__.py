@@ -21,7 +21,7 @@ __all__ = ["TASKS", "make_env", *_MODULES]
 __getattr__, __dir__ = lazy_exports(__name__, _MODULES)
 
 TASKS = ("carry", "clash", "grasp", "handover", "meet", "peg", "stack", "wipe")
-_MOST_STEPS = 900  # Half a minute at 30 Hz.
+_MOST_STEPS = 900  # An episode ends after this number of steps: half a minute at 30 Hz.
 
 for _task in TASKS:
     gymnasium.register(

@@ -46,7 +46,7 @@ class Ticks:
     gripper: Array  # (n, arms) The gripper's opening that the operator wants, 0 closed .. 1 open.
     now: Array  # (n,) Time of the tick by the loop's own clock [s].
     unmeasured: Flags  # (n, arms) True if a measured number, or a number of the reference, is not finite.
-    joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed and the speed limit of that joint.
+    joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed to the speed limit of that joint.
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,7 @@ class EpisodeFigures:
     idle_share: float | None
     hands: dict[str, HandFigures]
     arms: dict[str, ArmFigures]
-    measured: dict[str, MeasuredFigures]  # By arm.
+    measured: dict[str, MeasuredFigures]  # The figures of the measurements, by arm.
     cameras: dict[str, CameraFigures]
     empty_topics: list[str]  # The topics that should have a message and have none.
     faults: list[Fault]

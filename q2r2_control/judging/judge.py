@@ -198,7 +198,7 @@ class Unreadable:
 
 
 def judge(recording: Recording, settings: JudgeSettings | None = None, *, pictures: bool = True) -> list[Judged]:
-    """Judge a recording's episodes by ``settings``, or by the thresholds of its cell if None.
+    """Judge a recording's episodes by ``settings``; if it is None, by the thresholds of the recorded cell.
 
     Raises the same errors as :func:`read_episode`.
     """

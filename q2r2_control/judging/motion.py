@@ -109,7 +109,7 @@ class Track(NamedTuple):
 
 
 def delays(episode: Episode, hand: str) -> list[float | None]:
-    """Return two delays [s]: of the target, and of the measured tool, behind the poses of a hand as they were received.
+    """Return the delays of the target and of the measured tool behind the received poses of a hand [s].
 
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
     the arm is engaged. Here v is the velocity of the target or tool, and M (3, 3) maps the hand's axes to the world, as
@@ -236,7 +236,7 @@ def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
 
 
 def idle_share(episode: Episode) -> float | None:
-    """Return the share of the run, until it begins to end, in which no engaged arm moves.
+    """Return the share of the run in which no engaged arm moves. The end of the run is left out.
 
     An arm moves if its tool pose, at the controller's reference, differs by more than 2 mm or 0.02 rad from its pose
     half a second earlier or later. It also moves if its gripper gets another command in that time. Thus an arm that

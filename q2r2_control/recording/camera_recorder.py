@@ -50,7 +50,7 @@ class PictureRequest(NamedTuple):
     """A request for one picture of each of some cameras, at one tick."""
 
     number: int  # The number of the tick.
-    time: int  # The Unix time [ns].
+    time: int  # The Unix time of the tick [ns].
     cameras: list[str]
     qpos: bytes  # The model's qpos as float64: the positions of all joints and loose bodies.
 
@@ -93,7 +93,7 @@ class CameraRecorder:
             **ENVIRONMENT,
         )
         self.due = 0  # The number of pictures that were due up to now.
-        self._plant: MujocoPlant | None = None  # None before :meth:`prepare`.
+        self._plant: MujocoPlant | None = None  # The simulation; None before :meth:`prepare`.
         self._rates: dict[str, float] = {}  # The rates of the cameras [Hz].
         self._last: dict[str, int] = {}  # By camera, the number of its last picture.
         self._next = -math.inf  # The time since the start of the run at which the next picture is due [s].

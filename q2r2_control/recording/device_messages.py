@@ -31,7 +31,8 @@ class DeviceMessages:
         """Return the messages of all pictures since the last call, and the events of cameras, such as a stop.
 
         In a message, ``sent`` is the Unix time at which its picture was captured. ``time`` is the Unix time at which
-        the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of ``time``.
+        the picture was received. For a picture of depth, ``time`` is the Unix time of this call, which is made at
+        ``now`` [s]. The file's messages are in the order of ``time``.
         """
         messages, reasons = [], []
         for name, stream in self.streams.streams.items():

@@ -1,6 +1,6 @@
 """Reads MCAP files of any writer, also files whose end is missing.
 
-The package ``mcap`` decodes the records. In a file whose end is missing, it cannot find them. Therefore this module
+The package ``mcap`` decodes the records, but cannot find them in a file whose end is missing. Therefore this module
 goes through the file from record to record. The rules of the format are in https://mcap.dev/spec.
 """
 

@@ -180,7 +180,7 @@ def heard_on(topic: str) -> str:
 
 
 def is_compressed(topic: str) -> bool:
-    """Return whether a camera's topic has CompressedImage messages. image_transport gives such topics this ending."""
+    """Return whether a camera's topic has CompressedImage messages, by the ending that image_transport gives it."""
     return topic.endswith("/compressed")
 
 

@@ -60,7 +60,7 @@ class RecordedHands:
         self._say = say
         # All times below count from the first recorded tick, or from the first poll [s].
         self._samples: list[tuple[float, list[HandSample]]] = []  # The ticks with samples: their times and samples.
-        self._changes: list[tuple[float, bool]] = []  # Times from which the hands were connected, or were not.
+        self._changes: list[tuple[float, bool]] = []  # Times [s] from which the hands are connected or not.
         ticks = RecordedTicks(recording)
         # The time of the first tick, or of the start if there is no tick, by the recorded clock [s].
         self._begins = ticks.next.now if ticks.next is not None else ticks.start.now
@@ -83,7 +83,7 @@ class RecordedHands:
         fast: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> RecordedHands:
-        """Read the samples of ``recording``. They are the same at any pace, so ``fast`` has no effect."""
+        """Read the samples of ``recording``. The samples are the same at any pace, so ``fast`` has no effect."""
         if recording is None:
             raise ConfigError("--input recording needs --recording FILE")
         return cls(Path(recording), config, say)

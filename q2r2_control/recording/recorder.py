@@ -212,7 +212,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self._waits = waits
         self._count = 0  # The number of ticks so far.
         self.overflows = 0  # The number of ticks that were lost because too much data waited.
-        self._packer: TickPacker | None = None  # None before :meth:`begin`.
+        self._packer: TickPacker | None = None  # Packs the ticks; None before :meth:`begin`.
         self._batch: list[PackedTick] = []
         # For each batch that is not yet written, the number of ticks up to its end, and the loop's time at its end [s].
         self._sent: deque[tuple[int, float]] = deque()

@@ -114,7 +114,7 @@ class RosTicks:
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
         self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
-        self._targets: dict[int, tuple[int, Array]] = {}  # By the arm's index, the time of receipt [ns] and the pose.
+        self._targets: dict[int, tuple[int, Array]] = {}  # By arm, its target: time of receipt [ns], pose.
         self._samples: list[Array] = []
         self._events: list[Event] = []
         self._due: deque[_Tick] = deque()  # Ticks that wait for their references.

@@ -96,9 +96,9 @@ class Contract:
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
-        """Note that the controller has accepted ``openings``.
+        """Take the ``openings`` that the controller has accepted.
 
-        ``before_step`` is False if this is known only after a step, from its reference.
+        ``before_step`` is False if it is known only after a step that the controller has accepted them.
         """
         if before_step:
             self._stop = self._controller.stop_deceleration
@@ -135,7 +135,7 @@ class Contract:
     def check(
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
     ) -> None:
-        """Like :meth:`observe`. Raises :class:`AssertionError` with the broken promises and the values seen."""
+        """Check one tick as :meth:`observe` does. Raises :class:`AssertionError` with the broken promises."""
         if broken := self.observe(reference, dt, unusable, failed):
             found = "; ".join(self.margins[key].described(value) for key, value in broken.items())
             raise AssertionError(f"tick {self.ticks - 1}: {found}")

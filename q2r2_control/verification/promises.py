@@ -136,7 +136,7 @@ class MeasuredDistances:
         return np.asarray(self._values(q) - self.kept + self._at_corners)
 
     def reported_margin(self, report: StepReport) -> float:
-        """Return the smaller of two margins in a report [m]: that of the tightest pair, and that of the nearest pair."""
+        """Return the smaller of two margins in a report [m]: that of its tightest and that of its nearest pair."""
         closest = frozenset(report.closest_pair)
         if closest in self._objects:
             return report.margin
@@ -146,9 +146,9 @@ class MeasuredDistances:
     def compare(self, q: Array, report: StepReport) -> tuple[Array, list[float]]:
         """Return the margins (p,) [m], and the errors of the least distance and margin in a report [m].
 
-        Some pairs are not compared: pairs in penetration, because Coal defines their depth differently; pairs that may
-        touch, because the controller rounds their boxes; and pairs of held objects and of moving obstacles, because
-        they are not among the monitored pairs.
+        There are no errors while a pair is in penetration, because Coal defines the depth differently. Pairs that may
+        touch are not compared, because the controller rounds their boxes. Pairs of held objects and of moving obstacles
+        are not compared, because they are not among the monitored pairs.
         """
         values, margins = self._values(q), self.margins(q)
         closest, tightest = frozenset(report.closest_pair), frozenset(report.tightest_pair)

@@ -104,7 +104,7 @@ def run_soak(
 ) -> SoakReport:
     """Run a soak of the controller of a cell.
 
-    At ticks without an injected fault, ``solver`` is used; the cell's solver if it is None.
+    At ticks without an injected fault, ``solver`` is used. If it is None, the cell's solver is used.
     """
     robot = Robot.from_config(config)
     settings = config.control.timed(realtime=True)
