@@ -68,16 +68,16 @@ class Episode:
 
     seed: int
     succeeded_after: float | None  # Time until success [s]; None if the episode did not succeed.
-    contacts: int  # Number of contacts that began between the arms.
+    contacts: int  # Number of times that the arms began to touch each other.
     nearest: float  # Least distance between the arms [m].
-    beyond_position: float  # Largest excess over a position limit [rad].
+    beyond_position: float  # Largest angle by which a joint exceeded a position limit [rad].
     breaks_position: bool  # True if a joint exceeded a position limit.
     velocity_ratio: float  # Largest velocity of a joint, divided by its limit.
     breaks_velocity: bool  # True if a joint exceeded its velocity limit.
 
 
 def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
-    """Yield the names of a task and of a controller, and the function that makes their cell.
+    """Yield the name of a task, the name of a controller, and a function that makes a cell of both, for each such pair.
 
     If a task or a controller is left out, print the reason on stderr.
     """
@@ -142,7 +142,7 @@ def main(
     only: Annotated[str, typer.Option(help="Play only tasks and controllers whose names contain this text.")] = "",
     json: Json = False,
 ) -> None:
-    """Play the tasks with each controller, and print what happened to the arms."""
+    """Play the tasks with each controller, and print the successes, contacts, distances and exceeded limits."""
     data, rows = {}, []
     for task, controller, make in cells():
         name = f"{task} {controller}"

@@ -118,8 +118,8 @@ class RobosuiteCell:
     def _delta(self, side: str, tool: pin.SE3, target: pin.SE3) -> Array:
         """Return the action (6,) with which robosuite's controller OSC moves a tool to ``target``.
 
-        The axes are those of the arm's base frame. The first three numbers are steps along the axes, divided by the
-        largest step (0.05 m). The last three are turns about the axes, divided by the largest turn (0.5 rad).
+        The first three numbers are steps along the axes of the arm's base frame, divided by the largest step (0.05 m).
+        The last three numbers are turns about these axes, divided by the largest turn (0.5 rad).
         """
         way, turn = target.translation - tool.translation, pin.log3(target.rotation @ tool.rotation.T)
         base = self._env.robots[list(self.arms).index(side)].base_ori
@@ -150,8 +150,8 @@ class RobosuiteCell:
         axis = _towards_right(handle.xmat)
         closing = np.cross(axis, [0.0, 0.0, 1.0])
         closing *= np.sign(closing @ tools["left"].rotation[:, 0])
-        # Distance from the handle's middle to the left grasp [m]. It keeps the grasp at y >= _MIN_GRASP_Y, because the
-        # left hand cannot point down nearer to its base.
+        # Distance from the handle's middle to the left grasp [m]. With this distance, the grasp is at y >=
+        # _MIN_GRASP_Y, because the left hand cannot point down nearer to its base.
         way = min(half, max((handle.xpos[1] - _MIN_GRASP_Y) / max(axis[1], 1e-6), 0.0))
         grasp = pin.SE3(looking_down(closing), handle.xpos - way * axis)
         brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING_PLACE - [0.0, way, 0.0])

@@ -1,6 +1,6 @@
 """Make our :class:`Robot` from any model that MuJoCo has compiled, with the same joints, mounts and shapes.
 
-Kinematics and position limits are those of the model. A MuJoCo model has no velocity limits, so the caller gives them.
+Kinematics and position limits come from the model. A MuJoCo model has no velocity limits, so the caller gives them.
 A gripper is a part of the link to which it is attached. Its shape contains everything that it sweeps between open and
 closed.
 """

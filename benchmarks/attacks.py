@@ -28,7 +28,7 @@ from q2r2_control.verification.fault_injection import PushingSolver
 from q2r2_control.viewer.tables import figure_table
 
 _DT = 0.002  # Period of the ticks, unless a row of the table names another period [s].
-_TOOL_SPEED = 0.25  # The tool speed that a cell promises in one of the rows [m/s].
+_TOOL_SPEED = 0.25  # In one row of the table, the cell promises that no tool is faster than this [m/s].
 _LOOP_DT = 0.004  # Period of the loop that stalls [s].
 _BALL = 0.1  # Radius of the moving body [m].
 

@@ -52,7 +52,7 @@ OTHERS = {"precision": PRECISION, "speed": SPEED}
 
 SETTLING_S = 0.7  # Time before a tone or a tremor is measured, in which the motion settles [s].
 ARM, HAND = "left", "left"
-MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of intended motions.
+MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of motions on purpose.
 TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
 TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
 SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
@@ -95,10 +95,10 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True)
 class FeelFigures:
-    """The figures of one filter. Delays and gains are those of the measured tool relative to the hand."""
+    """The figures of one filter. Delays and gains compare the motion of the measured tool with the hand's motion."""
 
     name: str
-    filter_delay_ms: float  # Delay of the filter alone, from its settings.
+    filter_delay_ms: float  # Delay of the filter alone, computed from its settings.
     delays_ms: tuple[float, ...]  # Delay for each of :data:`MOTIONS`.
     gains_db: tuple[float, ...]  # Gain for each of :data:`MOTIONS`.
     # Gain for each of :data:`TREMOR_FREQUENCIES` of a hand that moves at :data:`SLOW_SPEED`.
@@ -114,14 +114,14 @@ class FeelFigures:
     band_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that moves at :data:`SLOW_SPEED`.
     band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
     noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.
-    stop_delay_ms: float  # Time from the hand's rest until the tool stays within 2 mm of its own rest.
+    stop_delay_ms: float  # Time from the end of the hand's motion until the tool stays within 2 mm of its end position.
     overshoot_mm: float  # Largest distance of the tool beyond its position at rest.
     overshoot_percent: float  # Overshoot as a share of the path of the hand that stops.
     pauses_mm: tuple[float, ...]  # Drift of the tool over all pauses, for each of :data:`RESTING_NOISES`.
 
 
 def run_feel(config: Config) -> list[FeelFigures]:
-    """Measure the cell's filter and :data:`OTHERS`."""
+    """Measure the cell's filter, and the filters :data:`OTHERS`."""
     filters = {"this cell": config.teleop.filter} | OTHERS
     plain = config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": {}})})
     robot = Robot.from_config(plain)
@@ -244,9 +244,9 @@ class _Log:
         return 20.0 * math.log10(tool_rms / asked_rms)
 
     def stop(self) -> tuple[float, float]:
-        """Return the time from the hand's rest to the tool's rest [s], and the tool's overshoot [m].
+        """Return the time from the end of the hand's motion to the tool's rest [s], and the tool's overshoot [m].
 
-        The tool rests when it stays within 2 mm of its last position.
+        The tool is at rest when it stays within 2 mm of its last position.
         """
         t, _, tool = self._from(0.0)
         ahead = tool - tool[-1]
@@ -284,7 +284,7 @@ def _again_and_again(hand: str, t: float) -> HandInputs:
 
 
 def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
-    """Return a sine of ``frequency`` [Hz] and ``amplitude`` [m] on top of a steady motion at ``speed`` [m/s].
+    """Return a sine of ``frequency`` [Hz] and ``amplitude`` [m], added to a motion at constant ``speed`` [m/s].
 
     The sine grows from zero within the first half of :data:`SETTLING_S`.
     """
@@ -296,11 +296,11 @@ def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
 
 
 def tremor(band: tuple[float, float], rms: float, period: float, seed: int, speed: float = 0.0) -> Way:
-    """Return noise of this ``rms`` [m] on top of a steady motion at ``speed`` [m/s].
+    """Return noise of this ``rms`` [m], added to a motion at constant ``speed`` [m/s].
 
-    Its spectrum is flat within ``band`` [Hz] and zero outside. The noise repeats after ``period`` [s], over which its
-    RMS is exact. It is the sum of all tones of the band that repeat after the period. They have the same amplitude, and
-    random phases that depend on ``seed``.
+    The noise has a spectrum that is flat within ``band`` [Hz] and zero outside. It repeats after ``period`` [s], over
+    which its RMS is exact. The noise is the sum of all tones of the band that repeat after the period. These tones have
+    the same amplitude, and random phases that depend on ``seed``.
     """
     low, high = (round(frequency * period) for frequency in band)
     turns = 2.0 * math.pi * np.arange(low, high + 1) / period

@@ -53,7 +53,8 @@ def watch_until(end: Any) -> None:
 def stand_stills(processor: int) -> list[tuple[float, float]]:
     """Return start and end of each standstill of a processor until the watch ends [s].
 
-    This thread has the highest priority and only sleeps. If it wakes up late, its processor stood still.
+    The thread that runs this function has the highest priority and only sleeps. If it wakes up late, its processor
+    stood still.
     """
     os.sched_setaffinity(0, {processor})
     found = []
@@ -131,7 +132,7 @@ def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[st
 
 
 def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) -> dict[str, Any]:
-    """Measure while both hands go round circles for ``duration`` [s]; ``options`` are those of q2r2 fri-cabinet."""
+    """Measure while both hands go round circles for ``duration`` [s]; ``options`` go to q2r2 fri-cabinet."""
     words = [
         sys.executable,
         "-m",

@@ -99,7 +99,7 @@ def measure(name: str, duration: float, crowd: bool) -> RunFigures:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stderr is not None
-    lines: list[float] = []  # Time when each line came [s].
+    lines: list[float] = []  # Time when each line of the log came [s].
     disturbers: list[Crowd] = []
     for line in process.stderr:
         if (found := re.search(r"page: (http\S+)", line)) is None:

@@ -1,9 +1,10 @@
 """Which forces does a finger exert that presses on the table on purpose, in torque mode?
 
 The target of the left tool goes straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
-contact allows. It stays there, slides away from the arm's base or towards it while the tool presses, and rises again.
+contact allows. The target stays there, slides away from the arm's base or towards the base while the tool presses, and
+rises again.
 The slide has one of these two directions because they are the hardest: the arm then moves in its own plane, where its
-masses couple pressing and sliding. The controller and the impedance are those of a usual run. Forces are read from
+masses couple pressing and sliding. The controller and the impedance are as in a usual run. Forces are read from
 MuJoCo's contacts at every tick.
 """
 
@@ -87,8 +88,8 @@ class PressFigures:
     violations: int  # Number of broken promises of the controller, over all ticks.
 
 
-# Direction of the slide, rotor share and friction. The friction is that of metal on wood (0.3), that of the cell (0.6),
-# or that of rubber that grips well (0.9).
+# Direction of the slide, rotor share and friction coefficient. The coefficient is 0.3 (metal on wood), 0.6 (as in the
+# cell), or 0.9 (rubber that grips well).
 PRESSES = (
     *((PressSlide.AWAY, 1.0, friction) for friction in (0.3, 0.6, 0.9)),
     (PressSlide.TOWARDS, 1.0, 0.9),

@@ -39,8 +39,8 @@ NOTES = (
     "fallback ticks: Number of ticks of all runs in which the certified stop was executed.",
 )
 
-# By the kind of runs, the lower and upper bounds of the left tool's target (x, y, z), measured from the middle between
-# both tools at home [m]. For the right tool, y has the opposite sign.
+# For each kind of runs: the lower and upper bounds of the left tool's target (x, y, z), measured from the middle
+# between both tools at home [m]. For the right tool, y has the opposite sign.
 KINDS: dict[str, tuple[Array, Array]] = {
     "anywhere": (np.array([-0.25, -0.35, -0.3]), np.array([0.25, 0.35, 0.3])),
     "other side": (np.array([-0.2, -0.35, -0.15]), np.array([0.2, 0.0, 0.3])),
@@ -98,7 +98,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS_PER_KIND) -> list[RestF
 
 
 def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[str, pin.SE3]:
-    """Return a random target pose for each tool. Its rotation differs a little from the tool's rotation at home."""
+    """Return a random target pose for each tool. The rotation of a target is near the tool's rotation at home."""
     home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     middle = np.mean([pose.translation for pose in home.values()], axis=0)
     targets = {}

@@ -117,7 +117,7 @@ class _Probe:
         self._node = rclpy.create_node("latency_probe", context=self._context)
         self._commands: list[tuple[float, float, list[float]]] = []
         self._tool: PoseStamped | None = None
-        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        # ``listen`` has the type Any, because rclpy's type hints lack callbacks that get the message's stamps.
         listen: Any = self._on_command
         self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
         self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
@@ -180,7 +180,7 @@ class _Probe:
         while time.monotonic() < end:
             beside()
             message.pose.position.z = height + _STEP_SIZE * (len(steps) % 2)
-            steps.append(time.time())  # This is the clock of the middleware's stamps.
+            steps.append(time.time())  # The middleware's stamps have the same clock.
             publisher.publish(message)
             self._spin(random.uniform(*_STEP_PAUSES_S))
         if not self._commands:

@@ -115,14 +115,14 @@ class _Watcher:
 
     def __init__(self) -> None:
         self.active = False  # True if the controller is active.
-        self.engaged: dict[str, bool] = {}  # By arm, True if it is engaged.
+        self.engaged: dict[str, bool] = {}  # True for each arm that is engaged.
         self.last_event: dict[str, str] = {}  # Last event of each arm.
         self._commands: list[tuple[int, bytes]] = []  # Time [ns] and serialized message of each command.
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("load_watcher", context=self._context)
         # Messages are read after the run, because reading them at once would take as much time as a node takes.
-        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        # ``listen`` has the type Any, because rclpy's type hints lack callbacks that get the message's stamps.
         listen: Any = self._on_command
         qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
         node: Any = self._node

@@ -84,7 +84,7 @@ class PressError(Q2R2Error):
 
 
 def measure_presses(config: str, starts: int) -> PressReport:
-    """Press for the first time and four times more, at each of ``starts`` starts of the nodes.
+    """Start the nodes ``starts`` times. After each start, press for the first time, and then four times more.
 
     Raises :class:`PressError` if the nodes are not ready in time.
     """
@@ -118,7 +118,7 @@ class _Hand:
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("press_probe", context=self._context)
-        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        # ``listen`` has the type Any, because rclpy's type hints lack callbacks that get the message's stamps.
         listen: Any = self._node.create_subscription
         listen(Float64MultiArray, arm_flags("left"), self._on_flags, RECORDED_QOS)
         listen(PoseStamped, asked_target("left"), self._on_target, RECORDED_QOS)
@@ -152,7 +152,7 @@ class _Hand:
         """Press, and record what follows for longer than :data:`WATCHED_S`."""
         for times in (self._ticks, self._targets, self._commands, self._speeds):
             del times[:-1]
-        press = time.time()  # This is the clock of the middleware's stamps.
+        press = time.time()  # The middleware's stamps have the same clock.
         self._press()
         return PressRecording(
             press, tuple(self._ticks), tuple(self._targets), tuple(self._commands), tuple(self._speeds)

@@ -1,6 +1,6 @@
 """How long does it take from a controller's motion to the joint command, through a browser and its page?
 
-Meta's iwer emulates a headset in Chromium, and the run is that of q2r2 run --input webxr. A controller jumps by 5 mm
+Meta's iwer emulates a headset in Chromium. Everything else is as in q2r2 run --input webxr. A controller jumps by 5 mm
 at random times. The latency is the time from a jump to the first joint command that differs from the command before the
 jump. The page measures the time of the jump, and the run measures the time of the command, on the same computer. The
 latency includes the wait for the headset's next frame, which takes half a frame on average.

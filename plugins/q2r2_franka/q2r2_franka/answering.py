@@ -64,7 +64,7 @@ class RobotAnswers(AnsweringProcess):
 
 
 def main(commands: int, states: int) -> None:
-    """Answer the robots until the loop has ended and the arms are at rest. This is what the process runs."""
+    """Answer the robots until the loop has ended and the arms are at rest. The process runs this function."""
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
@@ -81,7 +81,7 @@ def main(commands: int, states: int) -> None:
         except Exception as error:
             with suppress(OSError):
                 from_loop.send(reason_of(error).encode())
-    # The process ends without running destructors. Those of the library would wait for robots that are disconnected.
+    # The process ends without running destructors, because the library's destructors would wait for lost robots.
     os._exit(0)
 
 

@@ -37,7 +37,7 @@ _PASSING = 0.0015  # Approximate time that a measurement takes to pass through n
 
 
 class FrankaCell:
-    """The states of all sessions as the loop knows them. It computes the commands for the sessions from them."""
+    """The states of all sessions as the loop knows them. This class computes the commands from these states."""
 
     def __init__(self, robot: Robot, states: Iterable[SessionState], period: float, longest: float) -> None:
         """Take the first states of the sessions.
@@ -158,7 +158,7 @@ class FrankaCell:
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Return the measurements of the robots. Its stamp is the arrival time of the oldest state."""
+        """Return the measurements of the robots. Their stamp is the arrival time of the oldest state."""
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         for arm, state in self.states.items():
             joints, newest = self._joints[arm], state.newest

@@ -31,7 +31,7 @@ class Checked:
     commands: int = 0
     motions: int = 0
     lost: int = 0  # Number of periods without a command.
-    # By the name of a limit, the greatest ratio of a number to its limit. A ratio above 1 violates the limit.
+    # For each name of a limit: the greatest ratio of a number to this limit. A ratio above 1 violates the limit.
     shares: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -80,7 +80,8 @@ class SessionState:
     def timing(self, now: float) -> ArmTiming:
         """Return the timing of the arm at ``now`` [s].
 
-        It has the arm's delay behind the other arm, the age of the newest state, and the usual time between states.
+        The timing has the arm's delay behind the other arm, the age of the newest state, and the usual time between
+        states.
         """
         behind = self.behind if self.wanted is CommandMode.POSITION else 0.0
         return ArmTiming(behind, now - self.arrival, self.usual)
