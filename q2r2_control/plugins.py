@@ -23,7 +23,7 @@ PLANTS = "q2r2_control.plants"
 PRESETS = "q2r2_control.presets"
 EXPORTS = "q2r2_control.exports"
 REASONS = "q2r2_control.reasons"
-# By group and name, the folders in plugins/ of packages that are not installed with q2r2_control.
+# For each group and name: the folder in plugins/ of the package, which is not installed with q2r2_control.
 _OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
 
 
@@ -39,7 +39,7 @@ def points_of(group: str) -> Mapping[str, EntryPoint]:
 
 @lru_cache(maxsize=32)
 def _points(group: str, folders: tuple[tuple[str, int], ...]) -> Mapping[str, EntryPoint]:
-    """Return the entry points of a group. ``folders`` are those of ``sys.path``, with their times of change [ns]."""
+    """Return the entry points of a group. ``folders`` are all folders of ``sys.path``, with times of change [ns]."""
     return {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
 
 

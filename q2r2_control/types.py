@@ -202,10 +202,10 @@ class ActionChunk:
 
     times: Array  # (n,) Ascending times of the loop's clock [s].
     period: float  # Time from one action to the next [s]. It is also given for a single action.
-    tools: Mapping[str, Array] = field(default_factory=dict)  # By arm (n, 7): x y z qx qy qz qw in the world frame.
-    # By arm (n, 6): translation [m] and rotation vector [rad], in the frame of the previous target.
+    tools: Mapping[str, Array] = field(default_factory=dict)  # (n, 7) for each arm: x y z qx qy qz qw in the world.
+    # (n, 6) for each arm: translation [m] and rotation vector [rad], in the frame of the previous target.
     motions: Mapping[str, Array] = field(default_factory=dict)
-    grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings, 0 closed .. 1 fully open.
+    grippers: Mapping[str, Array] = field(default_factory=dict)  # (n,) for each arm: openings, 0 .. 1 (open).
     postures: Array | None = None  # (n, nv) Positions of all joints, used where the tool poses leave them free [rad].
     fault: Reason | None = None  # Why the actions are not usable; None if they are.
 
@@ -285,7 +285,7 @@ class StepReport:
     closest_distance: float  # Distance of the closest pair [m].
     certified: bool  # Whether a stop is known that keeps all limits and distances.
     fallback: bool  # Whether the certified stop was executed, at least in part.
-    slack: float  # Largest violation of a row of unit norm [rad/s].
+    slack: float  # Largest violation of a row of the QP [rad/s]. All rows have unit norm.
     solve_time: float  # Time of the solver [s]; 0 if the solver was not needed.
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
     margin: float = math.inf  # Distance of that pair minus the distance that it has to keep [m].

@@ -274,7 +274,7 @@ def run_bench(
 
     The ``motions`` have to be made for the cell ``config``, such as ``config/dual_iiwa7.yaml``. The speed of a machine
     varies, so the controllers run one after the other, and this is repeated for ``rounds`` rounds. Computing times are
-    the medians over the rounds. All other figures are those of the last round.
+    the medians over the rounds. All other figures come from the last round.
     """
     robot = Robot.from_config(config)
     free = OwnController(without_pairs(config), config, "free air")

@@ -1,4 +1,4 @@
-"""Run the same motion with one QP solver after another, in one process. Compare times and motions with those of DAQP.
+"""Run the same motion with one QP solver after another, in one process. Compare its times and motions with DAQP's.
 
 The motion is the contact motion of the bench. Both tools are sent to positions that they cannot reach. Therefore rows
 and box of the QP are active at nearly every tick. All solvers get the same cell, targets and ticks, and no time limit.

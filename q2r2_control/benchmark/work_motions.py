@@ -44,7 +44,7 @@ class WorkMotion:
     path: Path
     # Positions (2, 3) through which the tools move from home [m]. The motion starts at the last of them.
     approach: tuple[Array, ...] = ()
-    # The angle by which each tool turns about the world's x axis during the approach [rad]. It keeps this angle.
+    # The angle by which each tool turns about the world's x axis during the approach [rad]. The tool keeps this angle.
     tilt: tuple[float, float] = (0.0, 0.0)
     has_goal: bool = False  # Whether both tools have to arrive at the last targets.
     reachable: bool = True  # Whether both arms can reach all targets with every distance kept.
@@ -143,7 +143,8 @@ def _uniform(t: float, length: float, speed: float, ramp: float) -> float:
     return speed * (t - 0.5 * ramp)
 
 
-_CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # Centre x and z, radius in x, rise in z [m].
+# For the laps: x of the centre and lowest z [m], amplitude in x [m], and amplitude in z [m].
+_CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04
 _CARRY_RAMP = 0.5  # Time to reach the speed, and time to stop [s].
 _LEAST_GAP = 0.18  # If tools are at equal heights and this far apart, the wrists are 20 mm apart [m].
 

@@ -35,7 +35,11 @@ class RememberedAnswers:
         return bool(self._answers)
 
     def ask(self, question: str, usual: Answer) -> Answer:
-        """Ask a question, and return the answer. Enter alone takes the answer of the earlier try, or else ``usual``."""
+        """Ask a question, and return the answer.
+
+        If the user presses only Enter, the answer of the earlier try is taken, or ``usual`` if there was no earlier
+        try.
+        """
         if self._yes:
             return usual
         earlier = self._answers.get(question)

@@ -27,7 +27,7 @@ from q2r2_control.ros.watching.findings import Finding, error
 
 _PACKAGE = "q2r2_control"
 
-# By the name of an extra, what does not work without its packages. The extra ros has its own function, _ros.
+# For each extra: a text on what does not work without its packages. The function _ros examines the extra ros.
 _NEEDS_EXTRA = {
     "web": "no --web, no --input webxr",
     "export": "no q2r2 export hdf5 and lerobot-v2.1",

@@ -43,7 +43,7 @@ _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: Comman
 class Pendant:
     """Acts as the operator at the pendants of the cabinets, and prints the states of the sessions.
 
-    It starts the overlays. After the given times in a session, it ends the session of the first cabinet.
+    It starts the overlays. It also ends sessions of the first cabinet, each after a time that the user has chosen.
     """
 
     def __init__(

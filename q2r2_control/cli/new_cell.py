@@ -59,7 +59,7 @@ class _Draft:
     file: Path
     data: dict[str, Any]
     notes: list[str] = field(default_factory=list)  # Notes about guessed values.
-    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model, capsules around its meshes.
+    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # The capsules around the meshes of each model.
     always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
     xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments that every xacro model gets, by name.
 

@@ -43,8 +43,8 @@ from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ROS_ARGUMENTS = "--ros-args"
-_ONCE = 3.0  # This is long enough to find a running set of nodes, and to get several messages of each node [s].
-_TIME = 4.0  # This is long enough to find a running set of nodes, and a second publisher of a topic [s].
+_ONCE = 3.0  # In this time, a running set of nodes is found, and each node sends several messages [s].
+_TIME = 4.0  # In this time, a running set of nodes and a second publisher of a topic are found [s].
 
 
 def set_tables(view: SetView, domain: str) -> Group:

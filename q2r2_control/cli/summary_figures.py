@@ -40,7 +40,7 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str |
 
 
 def _last_faults(summary: RunSummary) -> dict[str, Event]:
-    """Return, by arm, the arm's last event if it is a fault.
+    """Return the last event of each arm whose last event is a fault.
 
     A fault is an event in which something other than a button paused the arm or kept the arm from engaging.
     """

@@ -38,7 +38,7 @@ class TrialReport:
 
     task: str
     trials: int
-    failures: dict[int, str]  # By seed, the reason of the failure.
+    failures: dict[int, str]  # For each seed with a failure: the reason.
 
     @property
     def succeeded(self) -> int:

@@ -160,7 +160,7 @@ def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[n
 def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:
     """Return two dicts by feature: the vectors (n, size) of the n ``frames``, and the names of the vectors' numbers.
 
-    The ``frames`` are those of :func:`sample`. Grippers that the plant does not measure, or that are not commanded, are
+    The ``frames`` come from :func:`sample`. Grippers that the plant does not measure, or that are not commanded, are
     left out. Raises :class:`RecordingError`, without the file's name, if a number is not finite or if ``robot`` is not
     the recorded robot.
     """

@@ -43,7 +43,7 @@ def make_env(
 ) -> AsyncVectorEnv | SyncVectorEnv:
     """Make ``n_envs`` environments of a task, each in a process of its own if ``use_async_envs`` is True.
 
-    ``space`` and ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. By default an action has the
+    ``space`` and ``options`` go to :class:`q2r2_control.gym.task_env.TaskEnv`. By default an action has the
     numbers of a dataset's ``action``, which policies of lerobot return. ``cfg`` is the configuration that lerobot's
     EnvHub passes; it is not used.
     """

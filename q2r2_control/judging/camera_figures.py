@@ -64,8 +64,8 @@ class CameraFigures:
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    # The share of frozen pictures among the pictures just before which an arm moved. A picture is frozen if it equals
-    # the picture before it.
+    # Only pictures before which an arm moved count. This is the share of those that are frozen, which means that they
+    # equal the picture before.
     frozen_share: float | None
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
@@ -212,7 +212,7 @@ class _CameraLook:
 
 
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
-    """Return the cameras that were swapped: by the name of each camera, the name of the other camera.
+    """Return the name of each camera that was swapped, with the name of the other camera.
 
     Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's
     arm. A fixed camera and a camera on an arm are swapped if two conditions hold: Hardly anything stands still in the

@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_too
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags
 
-FRAME = 0.01  # A frame is a tick whose poses are kept. This is the time from one frame to the next [s].
+FRAME = 0.01  # The time from one frame to the next [s]. A frame is a tick whose poses are kept.
 SPEED_OVER = 0.02  # A measured speed is an average over at least this time, since ticks are not evenly spaced [s].
 
 
@@ -86,7 +86,7 @@ class Episode:
     hands: dict[str, Hand]  # The hands that an arm follows, by name.
     events: list[Event]
     damage: str | None  # The reason why the file cannot be read to its end; None if it can.
-    # By the name of a camera, its pictures. Cameras whose pictures were not read, or cannot be read, are missing.
+    # The pictures of each camera. Cameras whose pictures were not read, or cannot be read, are missing.
     pictures: dict[str, Pictures] = field(default_factory=dict)
     ended_by: str | None = None  # The fault that ended the run; None if no fault did.
     # True if the episode succeeded, as the task's own check or the operator says; None if that is not known.

@@ -227,7 +227,7 @@ def _empty_topics(episode: Episode) -> list[str]:
     """Return the topics that should have a message and have none.
 
     The list is empty for a file without an index, because the numbers of its messages are not known. It is also empty
-    for a recording of ROS nodes, because they may have published nothing.
+    for a recording of ROS nodes, because the nodes may have published nothing.
     """
     about, counts = episode.recording.about, episode.recording.counts
     if about.source != LOOP or counts is None or not len(episode.ticks.t):

@@ -239,7 +239,7 @@ def judgements_of(settings: JudgeSettings | None, file: Path) -> list[Judgement 
 
 
 def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
-    """Return the discarded episodes of a recording: by the number of the episode, the verdict in one line.
+    """Return the number of each discarded episode of a recording, with the verdict in one line.
 
     The number 0 stands for the whole recording. The pictures are judged if ``pictures`` is True.
 

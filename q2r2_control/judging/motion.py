@@ -79,8 +79,8 @@ def ldlj(position: Array, dt: float) -> float:
 
     LDLJ = -ln(T^3 / v_peak^2 * integral of |d^3 x / dt^3|^2 dt) over the duration T (Balasubramanian,
     Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015). The dimensionless jerk is
-    that of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. A single reach of minimum
-    jerk has about -5.3.
+    defined by Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. A single reach of
+    minimum jerk has an LDLJ of about -5.3.
     """
     velocity = np.diff(position, axis=0) / dt
     jerk = np.diff(velocity, n=2, axis=0) / dt**2
@@ -114,8 +114,8 @@ def delays(episode: Episode, hand: str) -> list[float | None]:
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
     the arm is engaged. Here v is the velocity of the target or tool, and M (3, 3) maps the hand's axes to the world, as
     the teleoperation does. The anchors, the scale and the time for which the hand rests do not matter. A delay is None
-    in three cases: The hand has an RMS speed below 10 mm/s, for example because it only turns. Its motion explains less
-    than half of the motion of the target or tool. No maximum is within (0, 0.5) s.
+    in three cases: The hand has an RMS speed below 10 mm/s, for example because it only turns. The hand's motion
+    explains less than half of the motion of the target or tool. No maximum is within (0, 0.5) s.
     """
     samples = episode.hands[hand]
     arm = episode.arms.index(samples.arm)
@@ -199,7 +199,7 @@ class ArmFigures:
 
 
 def arm_figures(episode: Episode, arm: str) -> ArmFigures:
-    """Return the figures of an arm; delays and smoothness are those of :func:`delays` and :func:`smoothness`."""
+    """Return the figures of an arm. Delays come from :func:`delays`, and smoothness comes from :func:`smoothness`."""
     index = episode.arms.index(arm)
     ticks = episode.ticks
     engaged = ticks.engaged[:, index] & ticks.following

@@ -152,8 +152,8 @@ def changes(about: About, config: Config, robot: Robot) -> list[str]:
 
     Args:
         about: The facts that the recorded run stated.
-        config: The cell now.
-        robot: The robot now.
+        config: The present cell.
+        robot: The present robot.
     """
     now = program()
     found = [

@@ -42,7 +42,7 @@ class CameraSetup:
 
     model: bytes  # The pickled mujoco.MjModel that the pictures show.
     cameras: dict[str, CameraConfig]
-    channels: dict[str, int]  # By camera, the channel in the file of the recording.
+    channels: dict[str, int]  # The channel of each camera in the file of the recording.
     waited_for: bool  # True if the loop waits for the pictures, as it does in simulated time.
 
 
@@ -95,7 +95,7 @@ class CameraRecorder:
         self.due = 0  # The number of pictures that were due up to now.
         self._plant: MujocoPlant | None = None  # The simulation; None before :meth:`prepare`.
         self._rates: dict[str, float] = {}  # The rates of the cameras [Hz].
-        self._last: dict[str, int] = {}  # By camera, the number of its last picture.
+        self._last: dict[str, int] = {}  # The number of each camera's last picture.
         self._next = -math.inf  # The time since the start of the run at which the next picture is due [s].
 
     def _on_answer(self, picture: Message | None) -> None:

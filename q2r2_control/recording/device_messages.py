@@ -16,11 +16,11 @@ class DeviceMessages:
     """Takes the pictures of a recording's open cameras. Times are by the monotonic clock."""
 
     streams: CameraStreams
-    channels: Mapping[str, int]  # By topic, the channel of its messages.
+    channels: Mapping[str, int]  # The channel of each topic's messages.
     day: Callable[[float], int]  # Converts a time [s] to the Unix time [ns].
     begin: float  # Time at which the recording begins [s].
     _watches: dict[str, CameraWatch] = field(init=False)
-    _numbers: dict[str, int] = field(init=False)  # By camera, the number of pictures so far.
+    _numbers: dict[str, int] = field(init=False)  # The number of each camera's pictures so far.
 
     def __post_init__(self) -> None:
         streams = self.streams.streams

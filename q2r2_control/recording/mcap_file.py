@@ -49,8 +49,8 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._types: dict[int, str] = {}  # By the id of a schema, the message type.
-        self._topics: dict[int, Topic] = {}  # By the id of a channel, its topic.
+        self._types: dict[int, str] = {}  # The message type for the id of each schema.
+        self._topics: dict[int, Topic] = {}  # The topic for the id of each channel.
         self._skipped: list[_Place] = []  # Chunks that were not read and may declare channels.
 
     def topics(self) -> dict[int, Topic]:
@@ -120,7 +120,7 @@ class McapFile:
 
         Channels that the records declare are stored.
         """
-        channels: dict[int, bool] = {}  # By channel, True if its topic is among ``topics``.
+        channels: dict[int, bool] = {}  # True for each channel whose topic is among ``topics``.
         for one in records:
             if isinstance(one, McapMessage):
                 channel = one.channel_id

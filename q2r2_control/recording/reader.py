@@ -225,7 +225,7 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
         paths: Files, and folders in which recordings are looked for at any depth.
 
     Returns:
-        The given files and the recordings in the folders, each once. Those of one folder are sorted by their paths.
+        The given files and the recordings in the folders, each once. The recordings of one folder are sorted by path.
 
     Raises:
         RecordingError: If a path does not exist, or if a folder has no recording.

@@ -1,7 +1,7 @@
 """Reads a recording of the ROS nodes as if one loop had made it.
 
-Each tick of the controller's node becomes a tick. It has the newest joint states, flags of the arms and targets that
-had been received by then. Its reference is the reference message with the same time as the tick.
+Each tick of the controller's node becomes one tick. It has the newest joint states, flags of the arms and targets that
+had been received before the tick's message. Its reference is the reference message with the same time as the tick.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class RosTicks:
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
         self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
-        self._targets: dict[int, tuple[int, Array]] = {}  # By arm, its target: time of receipt [ns], pose.
+        self._targets: dict[int, tuple[int, Array]] = {}  # Each arm's target: time of receipt [ns], pose.
         self._samples: list[Array] = []
         self._events: list[Event] = []
         self._due: deque[_Tick] = deque()  # Ticks that wait for their references.

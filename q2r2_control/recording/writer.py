@@ -79,7 +79,7 @@ class TickEncoder:
         self._slot = -1.0  # The newest tick is in this period of the standard topics; periods are counted from 0.
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # The time of the loop's clock at the start of the run [s].
-        self._stamps: dict[tuple[float, int], float] = {}  # By hand and column, the stamp of the last sample.
+        self._stamps: dict[tuple[float, int], float] = {}  # The stamp of the last sample, for each hand and column.
         self._templates = _templates(list(robot.joints))
         self._poses = {
             frame: MessageTemplate(messages.POSE, messages.pose_stamped(np.arange(1.0, 8.0), frame), 7)

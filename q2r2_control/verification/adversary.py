@@ -26,8 +26,8 @@ class Request(NamedTuple):
 Stream = Callable[[int, Array], Request]
 _TABLE = 0.2  # Height of the table's top, on which tools press, as in the shipped cells [m].
 _TICK = 0.001  # In each tick, a work motion at its usual speed goes on by this time [s].
-# A gain changes to its first value times one of these factors. A small separation gain slows the arms long before
-# contact, which tests little.
+# A gain changes to its value at the start, times one of these factors. With a smaller separation gain, the arms would
+# be slow long before contact, which would test little.
 _GAIN_SHARES = {
     **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
     **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},

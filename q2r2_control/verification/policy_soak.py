@@ -75,7 +75,7 @@ class HostilePolicy:
         return found
 
     def draw(self, segment: _Segment, tick: Tick) -> tuple[Any, Any]:
-        """Return random actions (n, size) and their times (n,) [s]. In some kinds of streams, either may be invalid."""
+        """Return random actions (n, size) and their times (n,) [s]. Actions or times of some streams are invalid."""
         random, names = self._random, action_names(self._robot, segment.space)
         count = int(random.integers(1, _MOST + 1))
         period = random.uniform(*_PERIODS)

@@ -63,7 +63,7 @@ class Violation:
     since_segment: int  # Number of ticks since the segment began.
     q: Array  # (nv,) Reference before the tick [rad].
     v: Array  # (nv,) Velocity of the reference before the tick [rad/s].
-    targets: dict[str, Any]  # By arm, a homogeneous matrix (4, 4), or the text of a target that is no pose.
+    targets: dict[str, Any]  # For each arm, a homogeneous matrix (4, 4), or the text of a target that is no pose.
     dt: str  # Duration of the tick, as text.
     error: str  # Text of the exception; empty if there was none.
 

@@ -16,7 +16,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# By the name of a peer, the package that it needs. The peer's module and class here have the name of the package.
+# The package that each peer needs. The peer's module and class in this folder have the name of the package.
 PEERS = {
     "roboplan": "roboplan",
     "roboplan, 10 nearest": "roboplan",
