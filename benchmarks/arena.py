@@ -50,7 +50,7 @@ NOTES = (
 
 
 class Cell(Protocol):
-    """A task of an environment with one controller. It plays one episode after the other."""
+    """A task of an environment, and the controller of its arms. A cell plays one episode after the other."""
 
     PERIOD: float  # Period of the hands' targets [s].
     judge: Judge

@@ -44,7 +44,7 @@ logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 
 
 class RobosuiteCell:
-    """One of robosuite's tasks with one of the controllers. It plays one episode after the other."""
+    """One of robosuite's tasks, and the controller of its arms. The cell plays one episode after the other."""
 
     PERIOD = PERIOD
 

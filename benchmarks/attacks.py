@@ -54,7 +54,7 @@ class _Writer:
 
 
 class _Blocker:
-    """A solver that blocks for 0.2 s, and says that it needed no time."""
+    """A solver that blocks for 0.2 s, but reports a solve time of 0 s."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         time.sleep(0.2)

@@ -52,7 +52,7 @@ OTHERS = {"precision": PRECISION, "speed": SPEED}
 
 SETTLING_S = 0.7  # Time before a tone or a tremor is measured, in which the motion settles [s].
 ARM, HAND = "left", "left"
-MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of motions on purpose.
+MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of deliberate motions.
 TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
 TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
 SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
@@ -60,14 +60,14 @@ SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis 
 # For a hand at rest: standard deviations of the sensor's noise [mm], and number of times that its arm is paused.
 RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time from that speed to rest [s].
-# Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, with a rest after each.
-# Peak speeds are 0.16 to 0.63 m/s, which the arm can follow sidewards.
+# Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, and rests after each
+# move. Peak speeds are 0.16 to 0.63 m/s, which the arm can follow sidewards.
 REACHES, REACH_REST_S = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
 TREMOR_BAND, TREMOR_BAND_RMS = (8.0, 12.0), 1e-3  # Frequencies [Hz] and RMS [m] of a tremor within a band.
 _BAND_PERIOD, _BAND_SEED = 4.0, 0  # Time after which the tremor within a band repeats [s], and seed of its phases.
 # Start and end of the press that engages, and start of the hand's motion [s].
 _PRESS_INTERVAL, _MOTION_BEGINS_S = (0.2, 0.35), 0.8
-_MEASURED_S = 2.0  # Measured duration of every tone [s].
+_MEASURED_S = 2.0  # Time for which every tone is measured [s].
 # Duration of the run at rest, and time when the hand that stops begins to slow down [s].
 _REST_RUN_S, _STOP_BEGINS_S = 3.0, 0.4
 _SIDEWARDS, _UP = 1, 2  # Indices of axes.
@@ -113,7 +113,7 @@ class FeelFigures:
     worst_reach_delay_ms: float
     band_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that moves at :data:`SLOW_SPEED`.
     band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
-    noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.
+    noise_um: float  # RMS of the tool's motion along the axis with the largest RMS, for a hand at rest.
     stop_delay_ms: float  # Time from the end of the hand's motion until the tool stays within 2 mm of its end position.
     overshoot_mm: float  # Largest distance of the tool beyond its position at rest.
     overshoot_percent: float  # Overshoot as a share of the path of the hand that stops.
@@ -215,7 +215,7 @@ class _Log:
         return delay, -20.0 * math.log10(abs(turn))
 
     def noise(self) -> float:
-        """Return the RMS of the tool's motion about its mean, along the worst axis [m]."""
+        """Return the RMS of the tool's motion about its mean position, along the axis with the largest RMS [m]."""
         chosen = np.array(self._t) >= 1.0
         return float(np.array(self._tool)[chosen].std(axis=0).max())
 
@@ -352,7 +352,7 @@ def _grown(t: float) -> float:
 
 
 def main(json: Json = False) -> None:
-    """Print what an operator feels of three filters: the cell's own, one for precision, and one for speed."""
+    """Print what an operator feels of three filters: the cell's own filter, PRECISION and SPEED."""
     config = load_config(DEMO_CONFIG)
     figures = run_feel(config)
     table = record_table(f"{config.name}: What an operator feels of a filter", figures, NOTES)

@@ -67,7 +67,7 @@ def stand_stills(processor: int) -> list[tuple[float, float]]:
 
 
 def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
-    """Return the number of late answers that were delayed by a standstill, or by an earlier answer that was so delayed.
+    """Return the number of late answers that a standstill has delayed, directly or by delaying an earlier answer.
 
     Both lists have pairs of a start and an end [s].
     """

@@ -22,9 +22,9 @@ from q2r2_control.cli.output import Json, print_report
 from q2r2_control.gym import TASKS
 from q2r2_control.viewer.tables import figure_table
 
-DURATION_S, WARM_UP_STEPS = 20.0, 5  # Default duration [s], and number of unmeasured steps before.
+DURATION_S, WARM_UP_STEPS = 20.0, 5  # Default measured time [s], and number of steps before it.
 STEP_RATE_HZ = 20  # Steps per second of simulated time, which is robosuite's default [Hz].
-ACTION_SHARE = 0.1  # Largest action, as a share of the largest allowed one.
+ACTION_SHARE = 0.1  # Largest action, as a share of the largest allowed action.
 
 Environment = tuple[str, Any, Callable[[], Any]]  # Name, environment, and a function that returns a random action.
 

@@ -127,7 +127,7 @@ def measure(name: str, duration: float, crowd: bool) -> RunFigures:
 def main(
     duration: Annotated[float, Option(min=5.0, help="Duration of each run [s].")] = 60.0, json: Json = False
 ) -> None:
-    """Measure a run alone, and one with a crowd on its page."""
+    """Measure a run without clients, and a run with a crowd on its page."""
     figures = [measure("alone", duration, False), measure("with the crowd", duration, True)]
     table = record_table(f"{WATCHERS} watchers and a hostile client on the page of a run", figures, NOTES)
     print_report({"duration_s": duration, "runs": [asdict(each) for each in figures]}, (table,), json)

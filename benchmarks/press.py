@@ -1,11 +1,10 @@
-"""Which forces does a finger exert that presses on the table on purpose, in torque mode?
+"""Which forces does a finger exert on the table if it presses on purpose, in torque mode?
 
 The target of the left tool goes straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
 contact allows. The target stays there, slides away from the arm's base or towards the base while the tool presses, and
-rises again.
-The slide has one of these two directions because they are the hardest: the arm then moves in its own plane, where its
-masses couple pressing and sliding. The controller and the impedance are as in a usual run. Forces are read from
-MuJoCo's contacts at every tick.
+rises again. The slide has one of these two directions because they are the hardest: the arm then moves in its own
+plane, where its masses couple pressing and sliding. The controller and the impedance are as in a usual run. Forces are
+read from MuJoCo's contacts at every tick.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ class PressFigures:
     impact_speed: float  # Speed of the tool in the tick before it first touches the table [m/s].
     impact_force: float  # Largest force in the first 0.25 s of contact [N].
     steady_force: float  # Mean force while the tool presses without sliding [N].
-    spring_force: float  # Stiffness times the mean height of the tool above its reference in the same time [N].
+    spring_force: float  # Stiffness times the tool's mean height above its reference during the same time [N].
     largest_force: float  # Largest force of the whole run [N].
     bound: float  # Stiffness times the largest allowed depth of the reference [N].
     bounce_s: float  # Time without contact between the first touch and the slide [s].

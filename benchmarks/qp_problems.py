@@ -132,7 +132,7 @@ def solve(test_set: QpProblems, count: int) -> qpbenchmark.Results:
             for settings, by_solver in test_set.solver_settings.items():
                 rows.append(_row(problem, solver, settings, by_solver[solver]))
     results = qpbenchmark.Results(None, test_set)
-    # All rows are added at once, because ``update`` copies all earlier rows for each new one.
+    # All rows are added at once, because ``update`` copies all earlier rows for each new row.
     results.df = pandas.DataFrame(rows)
     return results
 

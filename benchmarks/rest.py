@@ -28,7 +28,7 @@ DT = 0.001  # Period of a tick [s].
 # Arms count as resting if this acceleration is not larger: the RMS, over the last 0.5 s, of the norm of all joints'
 # accelerations [rad/s^2].
 MAX_REST_ACCELERATION = 0.1
-# Jolts are counted after this time [s]. By then, the jump of the targets has no more effect, and the arms slide.
+# Jolts are counted after this time [s], when the jump of the targets has no more effect and the arms slide.
 JOLTS_COUNT_AFTER_S = 2.0
 NOTES = (
     f"Targets stay constant for {DURATION_S:g} s. Most of them cannot be reached with every distance kept.",
@@ -58,7 +58,7 @@ class RestFigures:
     at_rest: int  # Number of runs whose arms rest at the end.
     # The acceleration of a run is the RMS, over the last 0.5 s, of the norm of all joints' accelerations [rad/s^2].
     median_acceleration: float  # Median over the runs [rad/s^2].
-    worst_acceleration: float  # Largest of all runs [rad/s^2].
+    worst_acceleration: float  # Largest acceleration of any run [rad/s^2].
     # Mean number of ticks of a run after JOLTS_COUNT_AFTER_S in which an acceleration changes by more than JOLT.
     jolts: float
     most_jolts: int  # Largest number of such ticks in one run.

@@ -52,7 +52,7 @@ class PressRecording:
     ticks: Sequence[float]  # Time when each tick of the arm's node ended. Some are before the press.
     targets: Sequence[float]  # Time when each target was published.
     commands: Sequence[float]  # Time when each joint command was published.
-    speeds: Sequence[float]  # Speed of the fastest joint of each joint command [rad/s].
+    speeds: Sequence[float]  # Speed of the fastest joint in each joint command [rad/s].
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,8 +51,8 @@ class StackFigures:
     max_error_mm: float | None = None  # Largest error of either tool, until the hands rest.
     path_error_mm: float | None = None  # RMS error from the pose that the hand asked for one filter delay earlier.
     end_error_mm: float | None = None  # Largest error of either tool at the end.
-    # Time from the end of the approach until both tools stay within 10 mm of the goal. None if they do not, or if the
-    # motion has no goal.
+    # Time from the end of the approach until both tools stay within 10 mm of the goal. None if they do not stay
+    # there, or if the motion has no goal.
     arrival_s: float | None = None
     fallback_percent: float | None = None  # Percentage of ticks in which the certified stop was executed.
     measured_distance_mm: float | None = None  # Least distance of a monitored pair at measured postures, from Coal.

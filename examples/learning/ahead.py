@@ -1,4 +1,4 @@
-"""Give each frame of a LeRobotDataset the action of a later frame, as a policy should learn it.
+"""Give each frame of a LeRobotDataset the action of a later frame, so that a policy learns the action that comes next.
 
     python examples/learning/ahead.py datasets/circle datasets/circle_ahead [--frames 1]
 

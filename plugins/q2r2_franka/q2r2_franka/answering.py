@@ -1,8 +1,8 @@
 """Answer the robots in a process of its own, so that a robot need not wait for a tick of the loop.
 
-The loop sends commands to this process. The process replies whether they came in time. After each state of a robot, it
-sends the state of the robot's session to the loop. Whatever ends the loop, the process goes on until the arms have come
-to rest by their certified stops.
+The loop sends commands to this process. The process replies whether the commands came in time. After each state of a
+robot, it sends the state of the robot's session to the loop. Whatever ends the loop, the process goes on until the arms
+have come to rest by their certified stops.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Turn the ticks of the loop into commands for the sessions of all arms.
 
 **The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, this time
-advances by 1 ms, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
-the loop extends the reference so far that no robot reaches the end of the reference before the next tick has come,
-unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the
-robots get the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first.
-If a robot reaches the end while a tick is computed, the sessions refuse the command of this tick, and it is withdrawn.
+advances by 1 ms, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of the loop
+extends the reference so far that no robot reaches the end of the reference before the next tick has come, unless the
+next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the robots get the
+certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first. If a robot
+reaches the end while a tick is computed, the sessions refuse this tick's command, and the command is withdrawn.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class FrankaCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # The deceleration is None if the reference is at rest. Any positive number will then do.
+            # The deceleration is None if the reference is at rest. Then any positive number can be used.
             stop = (1.0,) * JOINTS if deceleration is None else tuple(deceleration[joints].tolist())
             q, v = tuple(command.q[joints].tolist()), tuple(command.v[joints].tolist())
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -149,7 +149,7 @@ class FrankaCell:
         return self._longest_tick + self._margin + PERIOD
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of all arms whose robots were heard."""
+        """Return the timing of all arms whose robots have sent a state."""
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 
     @property

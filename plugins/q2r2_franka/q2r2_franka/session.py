@@ -36,7 +36,7 @@ class ArmSession:
     """The session of one arm.
 
     The commands of the arm lie on ``path``. While the arm follows the reference, each tick extends the path. Otherwise
-    the path ends with a stop, and the arm is held at its end.
+    the path ends with a stop, and the arm is held at the end of the path.
     """
 
     def __init__(self, arm: str, address: str, wanted: CommandMode, torque_limit: Array) -> None:
@@ -59,7 +59,7 @@ class ArmSession:
         state.rest = tuple(map(float, q))
 
     def end(self, problem: str) -> None:
-        """Note that commands no longer move the arm. ``problem`` says why."""
+        """Store that commands no longer move the arm. ``problem`` says why."""
         self.state.ended += self.state.following
         self.state.controlled = self.state.following = False
         self.state.problem = problem

@@ -55,7 +55,7 @@ class SessionState:
     address: str
     wanted: CommandMode = CommandMode.POSITION
     newest: Measured | None = None
-    arrival: float = -math.inf  # Arrival of the newest state.
+    arrival: float = -math.inf  # Time at which the newest state came.
     usual: float = PERIOD  # Usual time between two states.
     controlled: bool = False  # True while commands move the robot.
     following: bool = False  # True while the arm follows the reference.
@@ -126,8 +126,8 @@ class ArmCommand:
     """
 
     now: float  # Time of the tick by the monotonic clock [s].
-    start: float  # The reference leaves the earlier stop at this time of the reference [s].
-    end: float  # The step of this tick ends at this time of the reference [s].
+    start: float  # At this time of the reference [s], it leaves the earlier stop, and the step of this tick begins.
+    end: float  # At this time of the reference [s], the step of this tick ends.
     q: Joints  # Posture at the time ``end`` [rad].
     v: Joints  # Velocity at the time ``end`` [rad/s].
     deceleration: Joints  # Deceleration of the stop [rad/s^2].

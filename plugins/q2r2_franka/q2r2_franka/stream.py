@@ -97,7 +97,7 @@ class TorqueStream:
         """Return the torques to send now (7,) [Nm]: as near to ``wanted`` as the limits allow.
 
         The torque may change only by the limit of one period, even after periods without a command, because the robot
-        keeps the last torque in them.
+        keeps the last torque in such periods.
         """
         change = _RATE_MARGIN * TORQUE_RATE * PERIOD
         wanted = np.clip(wanted, -self._limit, self._limit)
