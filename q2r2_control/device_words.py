@@ -18,7 +18,7 @@ class DeviceWords:
     nobody: str = ""  # Why no person presses anything; empty if a person does.
 
     def noun(self, control: str) -> str:
-        """Return ``control`` with the operator's noun for its name, which may be followed by "held" or "button"."""
+        """Return ``control`` with the operator's noun instead of its name. "held" or "button" may follow the name."""
         return re.sub(r"^(\w+)( button)?", lambda found: self.nouns.get(found[1], found[0]), control)
 
     def press(self, control: str) -> str:

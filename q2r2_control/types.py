@@ -102,7 +102,7 @@ class HandFault(StrEnum):
     """Faults of a hand whose pose alone looks valid. The values are kinds of :mod:`events`."""
 
     FROZEN = "hand_frozen"
-    FRAME_MOVED = "hand_frame_moved"  # Both hands moved as one, so that their frame has probably moved.
+    FRAME_MOVED = "hand_frame_moved"  # Both hands moved together, so their frame has probably moved.
     UNTRACKED = "hand_untracked"  # The headset reports no pose, or reports that its pose is a guess.
 
 
@@ -110,8 +110,8 @@ class HandFault(StrEnum):
 class HandSample:
     """One reading of one hand, as it was received. Nothing has been checked or normalised yet.
 
-    The pose and the controls arrive in separate messages. Each has its own time of receipt, so that a stream that stops
-    is noticed.
+    The pose and the controls arrive in separate messages. Pose and controls have separate times of receipt, so that the
+    stop of one stream is noticed.
     """
 
     hand: str
@@ -205,8 +205,8 @@ class ActionChunk:
     tools: Mapping[str, Array] = field(default_factory=dict)  # (n, 7) for each arm: x y z qx qy qz qw in the world.
     # (n, 6) for each arm: translation [m] and rotation vector [rad], in the frame of the previous target.
     motions: Mapping[str, Array] = field(default_factory=dict)
-    grippers: Mapping[str, Array] = field(default_factory=dict)  # (n,) for each arm: openings, 0 .. 1 (open).
-    postures: Array | None = None  # (n, nv) Positions of all joints, used where the tool poses leave them free [rad].
+    grippers: Mapping[str, Array] = field(default_factory=dict)  # (n,) for each arm: openings, 0 closed .. 1 open.
+    postures: Array | None = None  # (n, nv) Joint positions that are wanted as far as the tools leave them free [rad].
     fault: Reason | None = None  # Why the actions are not usable; None if they are.
 
     def as_json(self) -> dict[str, Any]:
@@ -348,5 +348,5 @@ class ArmTiming:
 
     @property
     def lag(self) -> float:
-        """The greatest possible lag of the arm now. While its next message is missing, the arm may stand still."""
+        """The greatest possible lag of the arm now. It grows with ``silent``, because a silent arm may stand still."""
         return (self.behind or 0.0) + max(self.silent - self.period, 0.0)

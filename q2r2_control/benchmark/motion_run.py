@@ -222,7 +222,7 @@ def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tup
 def arrival_time(to_goal: Array, dt: float) -> float | None:
     """Return the time after which both tools stay at their goals [s]; None if a tool is not there at the end.
 
-    ``to_goal`` (n, arms) are their distances from the goals in ticks of ``dt`` [s].
+    ``to_goal`` (n, arms) are the tools' distances from their goals [m], in ticks of ``dt`` [s].
     """
     away = np.flatnonzero((to_goal >= ARRIVED).any(axis=1))
     first = int(away[-1]) + 1 if len(away) else 0

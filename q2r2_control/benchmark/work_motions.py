@@ -113,7 +113,7 @@ def _to(
 ) -> WorkMotion:
     """Return a motion with a goal, in which both tools move straight from stop to stop.
 
-    Each item of ``stops`` is the time of travel to the stop [s], and the stop.
+    Each item of ``stops`` has the time of travel to a stop [s], and the stop.
     """
 
     def path(t: float, home: Array) -> Array:

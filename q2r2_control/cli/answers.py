@@ -58,7 +58,7 @@ class RememberedAnswers:
             self._keep()
 
     def forget(self) -> None:
-        """Remove the file, because the command succeeded. With ``yes`` it stays, because it was not used."""
+        """Remove the file, because the command succeeded. With ``yes``, the file stays, because it was not used."""
         if not self._yes:
             with suppress(OSError):
                 self.file.unlink(missing_ok=True)

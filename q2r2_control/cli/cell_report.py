@@ -63,7 +63,7 @@ class KeptPair(PairDistance):
 
 @dataclass(frozen=True, slots=True)
 class CellCheck:
-    """The parts of a cell, as the controller uses them, and its faults. Distances are those at home [m].
+    """The parts of a cell, as the controller uses them, and its faults. Distances are for arms at home [m].
 
     A cell without faults has an empty tuple ``faults``.
     """

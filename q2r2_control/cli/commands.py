@@ -1,4 +1,4 @@
-"""The commands of ``q2r2``, by group and in the order of its help. Calling a command imports its module."""
+"""The commands of ``q2r2``, in the groups and the order of its help. Calling a command imports its module."""
 
 from __future__ import annotations
 

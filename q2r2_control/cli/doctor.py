@@ -132,7 +132,7 @@ def _ports(cell: Config) -> Iterator[Finding]:
 
 
 def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """Yield a finding if there is no display. Only MuJoCo's window needs one."""
+    """Yield a finding if there is no display. Only MuJoCo's window needs a display."""
     if not has_display(environment):
         yield Finding(
             False,

@@ -34,7 +34,7 @@ from q2r2_control.viewer.tables import figure_table
 
 # Time between two judgements of tasks [s]. Judgements at this rate do not make a cabinet late.
 _JUDGED_EVERY = 0.005
-# The lines that the cabinets print: time between two readings [s], and the largest size of all lines [bytes].
+# Time between two readings of the lines that the cabinets print [s], and largest size of all these lines [bytes].
 _LOOKS, _LONGEST_LINES = 0.05, 1 << 16
 _SAFETY_STOP = 1.0  # Duration of a safety stop [s].
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}

@@ -326,7 +326,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
 
 
 def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
-    """If the models have no acceleration limits, set one with which a full stop stays within the torque limits."""
+    """If the models have no acceleration limits, set limits with which a full stop keeps the torque limits."""
     cap = config.control.acceleration_limit
     if np.isfinite(robot.acceleration_limit).all():
         return

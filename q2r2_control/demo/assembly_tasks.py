@@ -129,7 +129,7 @@ def with_controls(config: Config) -> Config:
 
 
 def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[float, float]) -> Config:
-    """Return the cell, in which all parts of ``tasks`` are displaced by ``place`` (x, y) [m]."""
+    """Return the cell with all parts of ``tasks`` displaced by ``place`` (x, y) [m]."""
     parts = {part for task in tasks for part in task.parts}
     objects = {
         name: item.model_copy(
@@ -143,7 +143,7 @@ def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[fl
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
-    """Return the ``results``. If the run broke a promise, all of them are failures."""
+    """Return the ``results``. If the run broke a promise, all returned results are failures."""
     results = tuple(results)
     if not summary.broken:
         return results
@@ -164,7 +164,7 @@ class TaskWatch:
             config: The cell of the run.
 
         Raises:
-            ConfigError: If the cell has not all parts of the tasks.
+            ConfigError: If the cell lacks a part of the tasks.
         """
         tasks = tuple(tasks)
         for task in tasks:

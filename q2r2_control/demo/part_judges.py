@@ -196,7 +196,7 @@ class LiftJudge(Judge):
 
 
 class CarryJudge(LiftJudge):
-    """As :class:`LiftJudge`, but both hands hold the part, 100 mm away, and it never tilts by 5 degrees or more."""
+    """The task of :class:`LiftJudge`, but with both hands, 100 mm away, and with a tilt that stays below 5 degrees."""
 
     _wanted = f"held by both hands, {1e3 * _LIFT:.0f} mm up and {1e3 * _CARRY:.0f} mm away,"
 

@@ -117,7 +117,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         vectors, labels = features(frames, robot)
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
-    # Actions that are motions already lead to the next frame, so they are not shifted.
+    # Actions that are motions already describe the motion to the next frame, so they are not shifted.
     for action in (ActionSpace.JOINTS, ActionSpace.TOOL):
         vectors[action] = _earlier(vectors[action], sampling.ahead)
     notes = dict(recording.about.notes)

@@ -154,7 +154,8 @@ def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
                 demo[name] = h5py.ExternalLink(moved.name, target)
             demo.attrs["num_samples"] = frames
             total += frames
-        # robomimic needs the description of an environment, even for training without one. Type 2 stands for Gym.
+        # robomimic needs the description of an environment, even if the training uses no environment. Type 2 stands for
+        # Gym.
         demos.attrs["env_args"] = json.dumps({"env_name": cell, "type": 2, "env_kwargs": {}})
         demos.attrs["total"] = total
 

@@ -201,7 +201,7 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
 
 
 def units_of(names: Names) -> Names:
-    """Return, by feature, the unit of each number. ``names`` are those that :func:`features` returns."""
+    """Return, by feature, the unit of each number. ``names`` come from :func:`features`."""
     return {feature: tuple(_unit(feature, label) for label in labels) for feature, labels in names.items()}
 
 
@@ -233,7 +233,8 @@ def continuous(poses: Array, first: Array | None = None) -> Array:
     """Return the ``poses`` (n, arms, 7) with quaternions whose signs do not change from frame to frame.
 
     A quaternion and its negative are the same rotation. At the first frame, the sign is chosen so that the quaternion
-    is nearer to that in ``first`` (arms, 7). Without ``first``, its number with the largest absolute value is positive.
+    is nearer to the quaternion in ``first`` (arms, 7). Without ``first``, the sign is chosen so that the quaternion's
+    number with the largest absolute value is positive.
     """
     quaternions = poses[..., 3:]
     if first is None:
@@ -262,7 +263,7 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of one camera, one for each frame of an episode.
+    """The pictures of one camera, with one picture for each frame of an episode.
 
     They show colours or depth. In depth, the number 0 stands for an unknown depth.
     """

@@ -75,7 +75,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording, or one episode of a recording. Times are since its beginning [s]."""
+    """One recording, or one episode of a recording. Times are measured from its beginning [s]."""
 
     recording: Recording
     config: Config
@@ -125,7 +125,7 @@ class Episode:
 def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
     """Read a recording, with or without its ``pictures``. A damaged file is read up to the damage.
 
-    Raises :class:`RecordingError` if its cell cannot be built, or if the robot is not the recorded one.
+    Raises :class:`RecordingError` if its cell cannot be built, or if its robot is not the recorded robot.
     """
     config, robot = cell_and_robot_of(recording)
     read = _Read(recording, robot)

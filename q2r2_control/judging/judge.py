@@ -122,7 +122,7 @@ def parts_of(episode: Episode) -> list[Episode]:
 
 
 def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
-    """Return an episode of a recording. Times are since the episode began, and its first tick has number 0."""
+    """Return an episode of a recording. Times are measured from its beginning, and its first tick has number 0."""
     ticks, frames = episode.ticks, episode.frames
     # ``searchsorted`` cannot be used: if the clock was set back, the times are not in ascending order.
     inside = np.flatnonzero((span.start <= ticks.t) & (ticks.t <= span.end))

@@ -15,15 +15,15 @@ from q2r2_control.judging.episode import FRAME, Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Flags
 
-# Smoothness is computed for short, overlapping time spans of a motion, which are called pieces. This is their
-# duration [s].
+# Duration of a piece [s]. Smoothness is computed for short, overlapping time spans of a motion, which are called
+# pieces.
 PIECE = 1.0
 _HOP = 0.25  # The time from the start of one piece to the start of the next [s].
 _FEWEST = 8  # Without at least this number of pieces, no smoothness is computed.
 _SLOWEST = 0.02  # Pieces with a lower mean speed of the tool do not count [m/s].
 _LONGEST_GAP = 0.05  # If two frames are farther apart than this, no piece may contain both [s].
-# Positions are smoothed by a Gaussian with this standard deviation before the jerk is computed [s]. It halves the power
-# at 6.6 Hz.
+# Positions are smoothed by a Gaussian with this standard deviation before the jerk is computed [s]. The Gaussian halves
+# the power at 6.6 Hz.
 _SMOOTHING = 0.02
 LONGEST = 0.5  # The longest delay that is searched for [s].
 _STEP = 0.005  # The step between two delays, and between the times at which velocities are compared [s].
@@ -158,7 +158,7 @@ def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
     """Return the delay [s] with the highest correlation, interpolated between two ``lags`` [s].
 
     Of several delays with nearly the same correlation, the delay nearest to zero is returned. The result is None if no
-    delay explains enough of the motion, or if the best one is the first or the last of ``lags``.
+    delay explains enough of the motion, or if the best delay is the first or the last of ``lags``.
 
     Args:
         lags: The delays to compare (k,) [s].

@@ -17,7 +17,7 @@ class Rejection:
 
 class _Unit(NamedTuple):
     name: str = ""
-    scale: float = 1.0  # The factor from the SI unit of the threshold to this unit.
+    scale: float = 1.0  # The factor from the SI unit of the threshold to the unit ``name``.
 
 
 @dataclass(frozen=True, slots=True)

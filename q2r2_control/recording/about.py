@@ -126,7 +126,8 @@ def as_yaml(config: Config) -> str:
 def program() -> dict[str, str]:
     """Return notes on the program's version, the machine and the libraries, by name.
 
-    If the program runs from a git checkout, they include its revision, which ends with -dirty if files were changed.
+    If the program runs from a git checkout, the notes include the revision, which ends with -dirty if files were
+    changed.
     """
     notes = {"version": _version("q2r2_control"), "machine": f"{platform.node()}, {platform.platform()}"}
     notes["libraries"] = ", ".join(f"{name} {_version(name)}" for name in ("numpy", "pin", "numba", "daqp", "mujoco"))

@@ -25,7 +25,7 @@ from q2r2_control.summary.tick import Tick
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco import MujocoPlant
 
-# Total size of the copied positions that may wait for the process [bytes]. For the shipped cell, they belong to some
+# Total size of the copied positions that may wait for the process [bytes]. In the shipped cell, this is enough for some
 # seconds of a camera at 30 Hz.
 ROOM = 128 << 10
 _NICENESS = 19  # The loop and the writer have a higher priority.

@@ -192,7 +192,7 @@ def is_latched(topic: str) -> bool:
 def is_reliable(topic: Topic) -> bool:
     """Return whether the recorder requests reliable delivery from ROS, so that all messages of a topic arrive.
 
-    For topics with commands and streams it does not, because their senders must not wait for the recorder.
+    For topics with commands and streams, the recorder does not request it, because their senders must not wait.
     """
     return topic.type in (ARRAY, TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 

@@ -115,7 +115,7 @@ class Recording:
         raise RecordingError(f"{self.file}: depth of camera {camera}: no picture was recorded")
 
     def _coded(self, names: Mapping[str, str]) -> Iterator[tuple[str, Picture]]:
-        """Yield all pictures on the topics in ``names``. Each comes with the name that ``names`` has for its topic."""
+        """Yield all pictures on the topics in ``names``. ``names`` maps a topic to the name that is yielded."""
         for messages in self.messages(names):
             for message in messages:
                 with self._faults():
@@ -174,7 +174,7 @@ class Recording:
 
     @property
     def conclusion(self) -> Conclusion:
-        """Return the facts that the run stated at its end. All are None if the file has no index."""
+        """Return the facts that the run stated at its end. All facts are None if the file has no index."""
         if self.closed:
             with self._faults():
                 for record in self._mcap.extras():
@@ -247,7 +247,7 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class EpisodeSpan:
-    """The time span of an episode within a run, and the operator's marks on it. Times are since the run began [s]."""
+    """The time span of an episode within a run, and the operator's marks on it. Times are since the run's start [s]."""
 
     start: float = -math.inf
     end: float = math.inf  # inf stands for the end of the run.

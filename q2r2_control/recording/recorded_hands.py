@@ -23,7 +23,7 @@ from q2r2_control.types import QUEST_CONTROLS, HandSample, HapticFeedback
 class RecordedHands:
     """An input that plays the samples of a recording once. It begins with the first poll.
 
-    After the last recorded tick it is not connected any more, so the arms pause.
+    After the last recorded tick, the input is not connected any more, so the arms pause.
     """
 
     options = ("recording", "fast", "say")

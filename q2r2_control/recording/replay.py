@@ -1,4 +1,4 @@
-"""Runs a recording again, in the pipeline's own loop. The recorded data replaces its clock, input and plant."""
+"""Runs a recording again, in the pipeline's own loop. Recorded data replaces the loop's clock, input and plant."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def open_recording(path: Path) -> Recording:
 class RosRecording(Recording):
     """A recording of the ROS nodes, which is read as ticks.
 
-    :meth:`chunks` raises :class:`RecordingError` if another controller than the built-in one moved the arms.
+    :meth:`chunks` raises :class:`RecordingError` if a controller other than ours moved the arms.
     """
 
     def chunks(self) -> Iterator[TickChunk]:
@@ -120,7 +120,7 @@ class RosTicks:
         self._due: deque[_Tick] = deque()  # Ticks that wait for their references.
         # References that wait for their ticks: the controller's time [s], and q, v and a (3, joints).
         self._references: deque[tuple[float, Array]] = deque()
-        # The newest tick has these two: the index that the controller gave it, and its number in this recording.
+        # The index that the controller gave to the newest tick, and the number of this tick in the recording.
         self._last_index, self._number = 0, -1
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             names.JOINT_STATES: self._on_joints,

@@ -39,7 +39,7 @@ class AveragedCommands:
         self._window = 2 * round(self._average.delay / _PERIOD) + 1  # Number of references in a mean.
         self._commands: deque[Array] = deque(maxlen=4)
         self._kept: deque[Array] = deque(maxlen=self._window)  # Kept distances (p,) at the newest regular ticks [m].
-        self._regular = 0  # Number of regular ticks since the last irregular one.
+        self._regular = 0  # Number of regular ticks since the last irregular tick.
 
     def start(self, q: Array) -> None:
         """Begin again at ``q`` (nv,) [rad], after a reset."""

@@ -275,7 +275,7 @@ class Contract:
     def _check_tools(self, q: Array, v: Array) -> None:
         """Check the speeds of the tools at ``q`` [rad] and ``v`` [rad/s].
 
-        Both are (nv,), or have one such row for each instant.
+        Both have the shape (nv,), or the shape (n, nv) with a row for each of n instants.
         """
         if self._tool_limit is not None and self._certain:
             self._note("tool_speed", self._tools.fastest(q, v) / self._tool_limit)

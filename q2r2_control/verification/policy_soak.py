@@ -46,7 +46,7 @@ class _Segment(NamedTuple):
     ticks: int
     every: int  # Number of ticks from one chunk to the next.
     step: float  # Largest step of an action [m or rad].
-    goal: Array  # The action to which most streams lead.
+    goal: Array  # The goal of most streams, as an action.
 
 
 class HostilePolicy:
@@ -105,7 +105,8 @@ class HostilePolicy:
     def goal(self, stream: str, space: ActionSpace, step: float) -> Array:
         """Return a random goal of a stream (size,).
 
-        It is an action to which most streams lead. In the space of tool motions, it is the motion in each action.
+        The goal is an action. The actions of most streams approach it step by step. In the space of tool motions, the
+        goal is the motion in each action.
         """
         random, robot = self._random, self._robot
         q = self._posture()
