@@ -161,7 +161,8 @@ class Command:
     """A command for the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
-    q: Array  # (nv,) Joint positions [rad]. In other modes, they are the reference, which plants may show.
+    # (nv,) Joint positions [rad]. In velocity and torque mode, they are the reference, which a plant may show.
+    q: Array
     v: Array  # (nv,) Joint velocities [rad/s].
     tau: Array  # (nv,) The commanded joint torques in torque mode [Nm].
     grippers: dict[str, float]  # Openings by arm, from 0 for closed to 1 for fully open.

@@ -228,7 +228,7 @@ def _draw_timing(axes: Axes, judged: Judged) -> None:
     """Draw the time between ticks, and a red background where ticks are missing in the file."""
     ticks = judged.episode.ticks
     axes.plot(*thinned(ticks.t, 1e3 * ticks.dt, np.fmax), color="#555555", linewidth=1.0, label="between ticks")
-    if judged.episode.recording.about.realtime:  # In simulated time the computing time does not matter.
+    if judged.episode.recording.about.realtime:  # Computing times do not matter in simulated time.
         compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
         axes.plot(*compute, color=_COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
     for number, at in enumerate(np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]):

@@ -69,7 +69,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def _begin(self) -> dict[int, int]:
         """Write all records that come before the first message.
 
-        Return the id in the file for the channel of each topic in this program.
+        Return a mapping from the channel that a topic has in this program to the channel's id in the file.
         """
         about = self._about
         self._writer.start("ros2", "q2r2_control")
@@ -140,7 +140,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
-        """Declare the topics. Return the id in the file for the channel of each topic in this program."""
+        """Declare the topics. Return a mapping from each channel in this program to the channel's id in the file."""
         qos = {"offered_qos_profiles": yaml_of([_QOS]).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):

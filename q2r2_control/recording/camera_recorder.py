@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Total size of the copied positions that may wait for the process [bytes]. In the shipped cell, this is enough for some
 # seconds of a camera at 30 Hz.
 ROOM = 128 << 10
-_NICENESS = 19  # The loop and the writer have a higher priority.
+_NICENESS = 19  # The niceness of this process. The loop and the writer have a higher priority.
 _QUALITY = 90  # The JPEG quality of the pictures.
 # A picture is already taken if the time until it is due is less than this share of its camera's period. Times are
 # rounded, so a picture that is due now may seem to be due a little later.

@@ -329,7 +329,7 @@ def data_of(payload: bytes, kind: str) -> Any:
 
 
 def numbers_of(payloads: list[bytes], count: int) -> Array:
-    """Return the numbers (n, count) of n messages with arrays. Raises :class:`ValueError` for another length."""
+    """Return the numbers (n, count) of n messages with arrays. Raises :class:`ValueError` for other lengths."""
     arrays = [data_of(payload, ARRAY) for payload in payloads]
     if any(len(array) != count for array in arrays):
         raise ValueError(f"an array that has not {count} numbers")

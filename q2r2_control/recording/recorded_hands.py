@@ -59,7 +59,7 @@ class RecordedHands:
         self.controls = replace(QUEST_CONTROLS, buttons=buttons, words=words)
         self._say = say
         # All times below count from the first recorded tick, or from the first poll [s].
-        self._samples: list[tuple[float, list[HandSample]]] = []  # The ticks with samples: their times and samples.
+        self._samples: list[tuple[float, list[HandSample]]] = []  # The time and the samples of each tick with samples.
         self._changes: list[tuple[float, bool]] = []  # Times [s] from which the hands are connected or not.
         ticks = RecordedTicks(recording)
         # The time of the first tick, or of the start if there is no tick, by the recorded clock [s].

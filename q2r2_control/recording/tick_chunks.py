@@ -25,7 +25,7 @@ class TickChunk:
     rows: Rows  # (n,) Rows with the dtype that tick_type returns.
     times: npt.NDArray[np.int64]  # (n,) The Unix times [ns].
     samples: Array  # (m, len(SAMPLE_FIELDS)) The m samples that the n ticks took.
-    states: dict[int, str]  # The state of a tick as JSON, for the tick's number.
+    states: dict[int, str]  # The states of ticks as JSON. The keys are the ticks' numbers.
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:
