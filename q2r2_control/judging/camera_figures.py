@@ -64,8 +64,8 @@ class CameraFigures:
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    # Only pictures before which an arm moved count. This is the share of those that are frozen, which means that they
-    # equal the picture before.
+    # The share of frozen pictures, which equal the picture before. A picture counts only if an arm has moved since the
+    # picture before.
     frozen_share: float | None
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.

@@ -50,7 +50,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._types: dict[int, str] = {}  # Message types. The keys are the ids of schemas.
-        self._topics: dict[int, Topic] = {}  # The keys are the ids of channels.
+        self._topics: dict[int, Topic] = {}  # Topics. The keys are the ids of channels.
         self._skipped: list[_Place] = []  # Chunks that were not read and may declare channels.
 
     def topics(self) -> dict[int, Topic]:
