@@ -247,7 +247,7 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class EpisodeSpan:
-    """The time span of an episode within a run, and the operator's marks on it. Times count from the run's start [s]."""
+    """The time span of an episode within a run, with the operator's marks. Times count from the run's start [s]."""
 
     start: float = -math.inf
     end: float = math.inf  # inf stands for the end of the run.
