@@ -3,8 +3,8 @@
     make arena  # makes a virtual environment with robosuite and runs this file there
 
 The same scripted hands give all controllers the same target poses. The hands read the true state of the simulation.
-The environment itself judges whether an episode succeeds. Contacts, distances and limits are measured in MuJoCo,
-whatever a controller reports about itself.
+The environment itself judges whether an episode succeeds. Contacts, distances and limits are measured in MuJoCo, and
+not taken from the reports of a controller.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ NOTES = (
 
 
 class Cell(Protocol):
-    """A task of an environment with one controller. It plays one episode after the other."""
+    """A task of an environment, and the controller of its arms. A cell plays one episode after the other."""
 
     PERIOD: float  # Period of the hands' targets [s].
     judge: Judge
@@ -68,16 +68,16 @@ class Episode:
 
     seed: int
     succeeded_after: float | None  # Time until success [s]; None if the episode did not succeed.
-    contacts: int  # Number of contacts that began between the arms.
+    contacts: int  # Number of times that the arms began to touch each other.
     nearest: float  # Least distance between the arms [m].
-    beyond_position: float  # Largest excess over a position limit [rad].
+    beyond_position: float  # Largest angle by which a joint exceeded a position limit [rad].
     breaks_position: bool  # True if a joint exceeded a position limit.
     velocity_ratio: float  # Largest velocity of a joint, divided by its limit.
     breaks_velocity: bool  # True if a joint exceeded its velocity limit.
 
 
 def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
-    """Yield the names of a task and of a controller, and the function that makes their cell.
+    """Yield the name of a task, the name of a controller, and a function that makes a cell of both, for each such pair.
 
     If a task or a controller is left out, print the reason on stderr.
     """
@@ -94,7 +94,7 @@ def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
 
 
 def play(cell: Cell, seed: int) -> Episode:
-    """Play one episode until it succeeds, the hands are done, or :data:`MAX_EPISODE_S` is over."""
+    """Play one episode until the task succeeds, the hands have no more targets, or :data:`MAX_EPISODE_S` is over."""
     cell.reset(seed)
     hands = ScriptedHands(cell.asks(), cell.tools())
     after, steps = None, 0
@@ -142,7 +142,7 @@ def main(
     only: Annotated[str, typer.Option(help="Play only tasks and controllers whose names contain this text.")] = "",
     json: Json = False,
 ) -> None:
-    """Play the tasks with each controller, and print what happened to the arms."""
+    """Play the tasks with each controller, and print the successes, contacts, distances and exceeded limits."""
     data, rows = {}, []
     for task, controller, make in cells():
         name = f"{task} {controller}"

@@ -1,4 +1,4 @@
-"""Scripted hands of the arena, and a judge that measures in MuJoCo, whichever controller moves the arms."""
+"""Scripted hands of the arena, and a judge that measures the arms of every controller in the same way, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ ARRIVAL_DISTANCE_M = 0.01  # A tool that is nearer than this to its target has a
 ARRIVAL_TIMEOUT_S = 0.5  # Longest time that a target at its goal waits for its tool to arrive [s].
 _MAX_MEASURED_DISTANCE_M = 0.05  # Distances between the arms are measured only below this [m].
 _STEPS_PER_MEASUREMENT = 20  # Number of physics steps from one measurement of the distance to the next.
-# Largest excess over a limit that counts as rounding, [rad] for positions and a share of the limit for velocities.
+# A smaller excess over a limit counts as a rounding error. It is in [rad] for positions, and a share of the limit for
+# velocities.
 _LIMIT_TOLERANCE = 1e-3
 
 
@@ -32,9 +33,10 @@ class Ask:
 
 
 class ScriptedHands:
-    """Targets that move straight from the poses of one :class:`Ask` to those of the next, at :data:`TARGET_SPEED`.
+    """Targets that move straight from the poses of one :class:`Ask` to the poses of the next, at :data:`TARGET_SPEED`.
 
-    Each of the ``asks`` is computed when it is due, so it may depend on the state of the simulation at that time.
+    The hands take the next of the ``asks`` only when they need it. Therefore an item may be computed from the state of
+    the simulation at that time.
     """
 
     def __init__(self, asks: Iterator[Ask], tools: Mapping[str, pin.SE3]) -> None:
@@ -79,9 +81,9 @@ def _moved(start: pin.SE3, goal: pin.SE3, dt: float) -> float:
 
 
 def looking_down(closing: Array, lean: float = 0.0) -> Array:
-    """Return the rotation (3, 3) of a tool whose z points down and whose x is the horizontal direction ``closing``.
+    """Return the rotation (3, 3) of a tool whose z axis points down and whose x axis has the direction ``closing``.
 
-    The tool is then turned about x by ``lean`` [rad].
+    ``closing`` is horizontal. The tool is then turned about its x axis by ``lean`` [rad].
     """
     x = np.array([closing[0], closing[1], 0.0]) / np.hypot(closing[0], closing[1])
     z = np.array([0.0, 0.0, -1.0])
@@ -105,8 +107,8 @@ class Judge:
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]
     contacts: int = 0  # Number of times that the arms began to touch each other.
-    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms. Larger distances are not measured [m].
-    beyond_position: float = 0.0  # Largest excess over a position limit [rad].
+    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms [m]; this maximum if they were farther.
+    beyond_position: float = 0.0  # Largest angle by which a joint exceeded a position limit [rad].
     velocity_ratio: float = 0.0  # Largest velocity of a joint, divided by its limit.
     _touching: bool = field(default=False, init=False)
     _looks: int = field(default=0, init=False)
@@ -139,7 +141,7 @@ class Judge:
         self._looks += 1
 
     def _measure(self, data: mujoco.MjData) -> None:
-        """Compute distances between the arms by Coal. MuJoCo 3.8 would return 0 for some boxes that are far apart."""
+        """Compute distances between the arms with Coal. MuJoCo 3.8 would return 0 for some boxes that are far apart."""
         apart = np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) - self._reach
         for pair in np.argsort(apart):
             if apart[pair] >= self.nearest:

@@ -38,13 +38,13 @@ _JOINT_CONTROL |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min
 _MEETING_PLACE = np.array([0.0, -0.15, 1.12])  # Position at which the right hand takes the hammer, in the world [m].
 _MIN_GRASP_Y = -0.5  # Least y at which the left hand can grasp while it points down [m].
 _RIGHT_HAND_LEAN = 0.9  # Angle by which the right hand leans towards its own base [rad].
-_CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' stroke from open to closed.
+_CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Positions of the fingers, from open (0) to closed (1).
 
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 
 
 class RobosuiteCell:
-    """One of robosuite's tasks with one of the controllers. It plays one episode after the other."""
+    """One of robosuite's tasks, and the controller of its arms. The cell plays one episode after the other."""
 
     PERIOD = PERIOD
 
@@ -72,7 +72,7 @@ class RobosuiteCell:
             ignore_done=True,
             seed=seed,
         )
-        self._env.sim.forward()  # This updates the poses of the objects that were placed last.
+        self._env.sim.forward()  # This updates the poses of objects that robosuite placed after its own update.
         self.model, self._data = self._env.sim.model._model, self._env.sim.data._data
         self.judge = Judge(self.model, self.arms)
         step = self._env.sim.step2
@@ -118,14 +118,15 @@ class RobosuiteCell:
     def _delta(self, side: str, tool: pin.SE3, target: pin.SE3) -> Array:
         """Return the action (6,) with which robosuite's controller OSC moves a tool to ``target``.
 
-        Each number is a share of the largest step, along or about an axis of the arm's base frame.
+        The first three numbers are steps along the axes of the arm's base frame, divided by the largest step (0.05 m).
+        The last three numbers are turns about these axes, divided by the largest turn (0.5 rad).
         """
         way, turn = target.translation - tool.translation, pin.log3(target.rotation @ tool.rotation.T)
         base = self._env.robots[list(self.arms).index(side)].base_ori
         return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)
 
     def asks(self) -> Iterator[Ask]:
-        """Yield the target poses and gripper states of the hands, which are computed when they are due."""
+        """Yield the target poses and gripper states of the hands. Each item is computed when the hands need it."""
         return self._lift() if self._task == "TwoArmLift" else self._handover()
 
     def _lift(self) -> Iterator[Ask]:
@@ -143,14 +144,14 @@ class RobosuiteCell:
         yield Ask({side: shifted(grasp, z=0.2) for side, grasp in grasps.items()}, closed=("left", "right"), pause=1.0)
 
     def _handover(self) -> Iterator[Ask]:
-        """Let the left hand bring the hammer by one end of its handle, and the right hand take the other end."""
+        """Let the left hand grasp the hammer's handle at one end and bring it. The right hand takes the other end."""
         tools, handle = self.tools(), self._data.geom("hammer_handle")
         half = float(self.model.geom("hammer_handle").size[2]) - 0.02  # Half of the distance between the grasps [m].
         axis = _towards_right(handle.xmat)
         closing = np.cross(axis, [0.0, 0.0, 1.0])
         closing *= np.sign(closing @ tools["left"].rotation[:, 0])
-        # Distance from the handle's middle to the left grasp [m]. It keeps the grasp at y >= _MIN_GRASP_Y, because the
-        # left hand cannot point down nearer to its base.
+        # Distance from the handle's middle to the left grasp [m]. With this distance, the grasp is at y >=
+        # _MIN_GRASP_Y, because the left hand cannot point down nearer to its base.
         way = min(half, max((handle.xpos[1] - _MIN_GRASP_Y) / max(axis[1], 1e-6), 0.0))
         grasp = pin.SE3(looking_down(closing), handle.xpos - way * axis)
         brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING_PLACE - [0.0, way, 0.0])
@@ -186,9 +187,9 @@ def _arm_model(number: int, velocity_limit: Array) -> ArmModel:
 
 
 def _closing(model: mujoco.MjModel, q: Array, arms: Mapping[str, ArmModel]) -> list[Array]:
-    """Return positions (nq,) of the whole cell, with grippers from open to closed.
+    """Return positions (nq,) of the whole cell, for each of :data:`_CLOSING_SHARES` of the grippers.
 
-    The actuators move the fingers there without any contact.
+    The actuators move the fingers to these positions in a simulation without contacts.
     """
     held = [int(model.joint(name).qposadr[0]) for arm in arms.values() for name in arm.joints]
     scratch, found = mujoco.MjData(model), []

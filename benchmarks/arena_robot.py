@@ -1,7 +1,8 @@
-"""Our robot made from any model that MuJoCo has compiled, with the same joints, mounts and shapes.
+"""Make our :class:`Robot` from any model that MuJoCo has compiled, with the same joints, mounts and shapes.
 
-Kinematics and position limits are those of the model. A MuJoCo model has no velocity limits, so the caller gives them.
-A gripper is a part of the link that carries it. Its shape is everything that it sweeps between open and closed.
+Kinematics and position limits come from the model. A MuJoCo model has no velocity limits, so the caller gives them.
+A gripper is a part of the link to which it is attached. Its shape contains everything that it sweeps between open and
+closed.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _CIRCLE_CORNERS = 16  # Number of corners of the polygon around a circle.
 class ArmModel:
     """The names of one arm's parts in a MuJoCo model."""
 
-    base: str  # Base body. The arm consists of this body and all bodies that it carries.
+    base: str  # Base body. The arm consists of this body and all its descendants.
     joints: tuple[str, ...]  # Hinge joints from base to tool.
     velocity_limit: Array  # Velocity limit of each joint (n,) [rad/s].
     tool: str  # Site that the controller moves.
@@ -55,7 +56,7 @@ def robot_of(model: mujoco.MjModel, arms: Mapping[str, ArmModel], closing: Seque
 
 
 def bodies_of(model: mujoco.MjModel, base: str) -> list[int]:
-    """Return the body ``base`` and all bodies that it carries, from the root outwards."""
+    """Return the body ``base`` and all its descendants, each of them after its parent."""
     found = [model.body(base).id]
     for body in range(found[0] + 1, model.nbody):
         if model.body_parentid[body] in found:
@@ -120,7 +121,7 @@ def _add_arm(
 
 
 def _carries(model: mujoco.MjModel, link: int, body: int) -> bool:
-    """Return whether there is no joint between a link and a body that it carries."""
+    """Return whether there is no joint between a link and its descendant ``body``."""
     while body != link:
         if model.body_jntnum[body]:
             return False
@@ -159,7 +160,7 @@ def _add_capsule(link: ET.Element, name: str, points: Array) -> None:
     _add_origin(collision, pose)
     size = {"radius": repr(float(capsule.radius)), "length": repr(float(2 * capsule.halfLength))}
     ET.SubElement(ET.SubElement(collision, "geometry"), "cylinder", size)
-    declared = link.find("collision_checking")  # A link has one such element, because readers ignore a second one.
+    declared = link.find("collision_checking")  # A link has only one such element, because parsers ignore a second one.
     if declared is None:
         declared = ET.SubElement(link, "collision_checking")
     ET.SubElement(declared, "capsule", name=name)

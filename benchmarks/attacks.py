@@ -1,4 +1,4 @@
-"""What do attacks reach that do not come through a target: hostile solvers, wild arguments, and a loop that stalls?"""
+"""What can attacks achieve that do not use targets: hostile solvers, invalid arguments, and a loop that stalls?"""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from q2r2_control.types import SIDES, Array, CommandMode, RobotState
 from q2r2_control.verification.fault_injection import PushingSolver
 from q2r2_control.viewer.tables import figure_table
 
-_DT = 0.002  # Period of the ticks, if a row names no other one [s].
-_TOOL_SPEED = 0.25  # The tool speed that a cell promises in one of the rows [m/s].
+_DT = 0.002  # Period of the ticks, unless a row of the table names another period [s].
+_TOOL_SPEED = 0.25  # In one row of the table, the cell promises that no tool is faster than this [m/s].
 _LOOP_DT = 0.004  # Period of the loop that stalls [s].
 _BALL = 0.1  # Radius of the moving body [m].
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one attack reached."""
+    """One figure of an attack: the value that the attack reached, and the values that are allowed."""
 
     attack: str
     figure: str
@@ -44,7 +44,7 @@ class Row:
 
 
 class _Writer:
-    """A solver that widens the limits that it gets, where it can, and answers with the widened ones."""
+    """A solver that widens the limits in its problem if it can write them, and returns velocities beyond the limits."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         for array, change in ((problem.lower, -1.0), (problem.upper, 1.0), (problem.rows_lower, -1.0)):
@@ -54,7 +54,7 @@ class _Writer:
 
 
 class _Blocker:
-    """A solver that blocks for 0.2 s, and says that it needed no time."""
+    """A solver that blocks for 0.2 s, but reports a solve time of 0 s."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         time.sleep(0.2)
@@ -137,7 +137,7 @@ class _Ball:
         return MovingObstacle(shape="sphere", size=(_BALL,), position=tuple(self._start.tolist()), speed=speed)
 
     def from_moving_bodies(self, q: Array, v: Array, t: float) -> float:
-        """Return the distance of the ball at ``t`` [s] from the nearest body of an arm that moves [m]."""
+        """Return the distance of the ball at ``t`` [s] from the nearest moving body of an arm [m]."""
         joints = [self._geometry.geometryObjects[body].parentJoint for body in self._bodies]
         moves = [
             any(abs(v[self._robot.model.joints[i].idx_v]) > 1e-3 for i in list(self._robot.model.supports[joint])[1:])
@@ -152,7 +152,7 @@ class _Ball:
 
 
 def stalls(robot: Robot, settings: Any, config: Any) -> Iterator[Row]:
-    """Report a ball once. It then flies to a swinging arm, while the loop stalls in one of 40 ticks."""
+    """Report a moving ball only once. The ball flies to a swinging arm, while the loop stalls in one of 40 ticks."""
     controller = CartesianController(robot, settings.model_copy(update={"moving_obstacles": ("hand",)}))
     drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
     loop = ControlLoop(controller, drive, _LOOP_DT, StreamSettings(), watch, owns_plant=True)

@@ -109,7 +109,7 @@ def main(
     plant: Annotated[str, Option(help="An installed plant.")] = "kinematic",
     json: Json = False,
 ) -> None:
-    """Measure runs without and with cameras, led by scripted hands and by a policy."""
+    """Measure runs without and with cameras, in which scripted hands or a policy move the arms."""
     figures = []
     with TemporaryDirectory() as kept:
         folder = Path(kept)

@@ -3,9 +3,9 @@
 A scripted hand oscillates at single frequencies, reaches, trembles, rests, and moves and stops. The tool is measured
 through the whole chain: samples at a headset's rate, teleoperation, the controller, and an arm in MuJoCo. A tone is a
 sine motion of one frequency. Its delay and gain come from least-squares fits of a sine and a cosine to the paths of
-hand and tool. Real hands do not move in tones, so reaches are measured, too. The delay of a reach is the delay at which
-the velocities of hand and tool have their highest correlation. The figures for a tremor within a band count all motion
-of the tool, also outside the band.
+hand and tool. Real hands do not move in tones, so reaching motions (reaches) are measured, too. The delay of a reach is
+the delay at which the velocities of hand and tool have their highest correlation. The figures for a tremor within a
+band count all motion of the tool, also outside the band.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ OTHERS = {"precision": PRECISION, "speed": SPEED}
 
 SETTLING_S = 0.7  # Time before a tone or a tremor is measured, in which the motion settles [s].
 ARM, HAND = "left", "left"
-MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of intended motions.
+MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of deliberate motions.
 TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
 TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
 SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
@@ -60,14 +60,14 @@ SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis 
 # For a hand at rest: standard deviations of the sensor's noise [mm], and number of times that its arm is paused.
 RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time from that speed to rest [s].
-# Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, with a rest after each.
-# Peak speeds are 0.16 to 0.63 m/s, which the arm can follow sidewards.
+# Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, and rests after each
+# move. Peak speeds are 0.16 to 0.63 m/s, which the arm can follow sidewards.
 REACHES, REACH_REST_S = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
 TREMOR_BAND, TREMOR_BAND_RMS = (8.0, 12.0), 1e-3  # Frequencies [Hz] and RMS [m] of a tremor within a band.
 _BAND_PERIOD, _BAND_SEED = 4.0, 0  # Time after which the tremor within a band repeats [s], and seed of its phases.
 # Start and end of the press that engages, and start of the hand's motion [s].
 _PRESS_INTERVAL, _MOTION_BEGINS_S = (0.2, 0.35), 0.8
-_MEASURED_S = 2.0  # Measured duration of every tone [s].
+_MEASURED_S = 2.0  # Time for which every tone is measured [s].
 # Duration of the run at rest, and time when the hand that stops begins to slow down [s].
 _REST_RUN_S, _STOP_BEGINS_S = 3.0, 0.4
 _SIDEWARDS, _UP = 1, 2  # Indices of axes.
@@ -95,10 +95,10 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True)
 class FeelFigures:
-    """The figures of one filter. Delays are from the hand to the measured tool."""
+    """The figures of one filter. Delays and gains compare the motion of the measured tool with the hand's motion."""
 
     name: str
-    filter_delay_ms: float  # Delay of the filter alone, from its settings.
+    filter_delay_ms: float  # Delay of the filter alone, computed from its settings.
     delays_ms: tuple[float, ...]  # Delay for each of :data:`MOTIONS`.
     gains_db: tuple[float, ...]  # Gain for each of :data:`MOTIONS`.
     # Gain for each of :data:`TREMOR_FREQUENCIES` of a hand that moves at :data:`SLOW_SPEED`.
@@ -113,15 +113,15 @@ class FeelFigures:
     worst_reach_delay_ms: float
     band_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that moves at :data:`SLOW_SPEED`.
     band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
-    noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.
-    stop_delay_ms: float  # Time from the hand's rest until the tool stays within 2 mm of its own rest.
+    noise_um: float  # RMS of the tool's motion along the axis with the largest RMS, for a hand at rest.
+    stop_delay_ms: float  # Time from the end of the hand's motion until the tool stays within 2 mm of its end position.
     overshoot_mm: float  # Largest distance of the tool beyond its position at rest.
     overshoot_percent: float  # Overshoot as a share of the path of the hand that stops.
     pauses_mm: tuple[float, ...]  # Drift of the tool over all pauses, for each of :data:`RESTING_NOISES`.
 
 
 def run_feel(config: Config) -> list[FeelFigures]:
-    """Measure the cell's filter and :data:`OTHERS`."""
+    """Measure the cell's filter, and the filters :data:`OTHERS`."""
     filters = {"this cell": config.teleop.filter} | OTHERS
     plain = config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": {}})})
     robot = Robot.from_config(plain)
@@ -200,7 +200,7 @@ class _Log:
         self._tool.append(tick.tools[ARM].translation.copy())
 
     def reaches(self, lasts: float) -> bool:
-        """Return whether the run lasted for ``lasts`` [s]."""
+        """Return whether the run lasted at least ``lasts`` [s]."""
         return bool(self._t) and self._t[-1] > lasts - _LONGEST_TICK_S
 
     def tone(self, frequency: float) -> tuple[float, float]:
@@ -215,7 +215,7 @@ class _Log:
         return delay, -20.0 * math.log10(abs(turn))
 
     def noise(self) -> float:
-        """Return the RMS of the tool's motion about its mean, along the worst axis [m]."""
+        """Return the RMS of the tool's motion about its mean position, along the axis with the largest RMS [m]."""
         chosen = np.array(self._t) >= 1.0
         return float(np.array(self._tool)[chosen].std(axis=0).max())
 
@@ -232,7 +232,7 @@ class _Log:
     def attenuation(self, period: float) -> float:
         """Return the RMS of the tool's motion over a ``period`` [s], divided by the RMS of the hand's motion [dB].
 
-        A steady motion of both does not count.
+        Motion at a constant velocity is subtracted from both motions first.
         """
         t, asked, tool = self._from(SETTLING_S)
         within = t < SETTLING_S + period
@@ -244,9 +244,9 @@ class _Log:
         return 20.0 * math.log10(tool_rms / asked_rms)
 
     def stop(self) -> tuple[float, float]:
-        """Return the time from the hand's rest to the tool's rest [s], and the tool's overshoot [m].
+        """Return the time from the end of the hand's motion to the tool's rest [s], and the tool's overshoot [m].
 
-        The tool rests when it stays within 2 mm of its last position.
+        The tool is at rest when it stays within 2 mm of its last position.
         """
         t, _, tool = self._from(0.0)
         ahead = tool - tool[-1]
@@ -284,7 +284,7 @@ def _again_and_again(hand: str, t: float) -> HandInputs:
 
 
 def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
-    """Return a sine of ``frequency`` [Hz] and ``amplitude`` [m] on top of a steady motion at ``speed`` [m/s].
+    """Return a sine of ``frequency`` [Hz] and ``amplitude`` [m], added to a motion at constant ``speed`` [m/s].
 
     The sine grows from zero within the first half of :data:`SETTLING_S`.
     """
@@ -296,11 +296,11 @@ def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
 
 
 def tremor(band: tuple[float, float], rms: float, period: float, seed: int, speed: float = 0.0) -> Way:
-    """Return noise of this ``rms`` [m] on top of a steady motion at ``speed`` [m/s].
+    """Return noise of this ``rms`` [m], added to a motion at constant ``speed`` [m/s].
 
-    Its spectrum is flat within ``band`` [Hz] and zero outside. The noise repeats after ``period`` [s], over which its
-    RMS is exact. It is the sum of all tones of the band that repeat after the period. They have the same amplitude, and
-    random phases that depend on ``seed``.
+    The noise has a spectrum that is flat within ``band`` [Hz] and zero outside. It repeats after ``period`` [s], over
+    which its RMS is exact. The noise is the sum of all tones of the band that repeat after the period. These tones have
+    the same amplitude, and random phases that depend on ``seed``.
     """
     low, high = (round(frequency * period) for frequency in band)
     turns = 2.0 * math.pi * np.arange(low, high + 1) / period
@@ -316,7 +316,7 @@ def tremor(band: tuple[float, float], rms: float, period: float, seed: int, spee
 def stop(speed: float, ramp: float, cruises: float) -> Way:
     """Return a motion that speeds up within ``ramp`` [s] and then moves at ``speed`` [m/s].
 
-    At the time ``cruises`` [s] it begins to stop, which takes ``ramp`` as well.
+    At the time ``cruises`` [s] it begins to stop, which also takes ``ramp`` [s].
     """
 
     def way(t: float) -> float:
@@ -352,7 +352,7 @@ def _grown(t: float) -> float:
 
 
 def main(json: Json = False) -> None:
-    """Print what an operator feels of three filters: the cell's own, one for precision, and one for speed."""
+    """Print what an operator feels of three filters: the cell's own filter, PRECISION and SPEED."""
     config = load_config(DEMO_CONFIG)
     figures = run_feel(config)
     table = record_table(f"{config.name}: What an operator feels of a filter", figures, NOTES)

@@ -1,4 +1,4 @@
-"""How fast are KUKA's cabinets answered, and how well do the arms follow through them?"""
+"""How fast do KUKA's cabinets get their answers, and how well do the arms behind the cabinets follow?"""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
 _CONFIG = "config/dual_iiwa7_fri.yaml"
-_MAX_DELAY_S = 0.1  # Longest delay of the tools behind their reference that is searched for [s].
+_MAX_DELAY_S = 0.1  # The delay of the tools behind their reference is searched for up to this delay [s].
 _WATCH_PRIORITY = 90  # Real-time priority of the watching threads, above all others.
 # A watching thread sleeps for the first of these times. If it wakes up late by more than the second time, its processor
 # stood still. The thread usually sleeps when a standstill begins, so each standstill of at least the sum of both times
 # is found. The sum is 1 ms, half of the shortest period that is measured [s].
 _WATCH_SLEEP_S, _MIN_LATENESS_S = 0.0005, 0.0005
 _CABINET_TIMEOUT_S = 60.0  # Timeout for the cabinets on a busy computer [s].
-_end: Any = None  # Time when the watch of this watching process ends, by the monotonic clock [s].
+_end: Any = None  # In a watching process: its ``value`` is the time at which the watch ends (monotonic clock) [s].
 
 
 def watch_until(end: Any) -> None:
@@ -53,7 +53,8 @@ def watch_until(end: Any) -> None:
 def stand_stills(processor: int) -> list[tuple[float, float]]:
     """Return start and end of each standstill of a processor until the watch ends [s].
 
-    A standstill delays even the thread with the highest priority, which only sleeps.
+    The thread that runs this function has the highest priority and only sleeps. If it wakes up late, its processor
+    stood still.
     """
     os.sched_setaffinity(0, {processor})
     found = []
@@ -66,7 +67,7 @@ def stand_stills(processor: int) -> list[tuple[float, float]]:
 
 
 def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
-    """Return the number of late answers that were delayed by a standstill, or by an earlier answer of this kind.
+    """Return the number of late answers that a standstill has delayed, directly or by delaying an earlier answer.
 
     Both lists have pairs of a start and an end [s].
     """
@@ -102,7 +103,7 @@ class ToolWay:
                 self._tools.extend(tick.tools[arm].translation)
 
     def errors(self, delays: range) -> list[float]:
-        """Return the error for each of the ``delays`` [ticks] of the tools behind their reference [mm RMS].
+        """Return the error [mm RMS] for each assumed delay of the tools behind their reference, in ``delays`` [ticks].
 
         Only ticks with a new measurement count.
         """
@@ -131,7 +132,7 @@ def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[st
 
 
 def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) -> dict[str, Any]:
-    """Measure while both hands go round circles for ``duration`` [s]; ``options`` are those of q2r2 fri-cabinet."""
+    """Measure while both hands go round circles for ``duration`` [s]; ``options`` go to q2r2 fri-cabinet."""
     words = [
         sys.executable,
         "-m",

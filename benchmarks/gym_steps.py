@@ -1,4 +1,4 @@
-"""How many steps per second do our environments make, and robosuite's two-arm environments with the same arms?
+"""How many steps per second do our environments and robosuite's two-arm environments make, with the same arms?
 
     make arena  # makes a virtual environment with robosuite and runs this file there
 
@@ -22,9 +22,9 @@ from q2r2_control.cli.output import Json, print_report
 from q2r2_control.gym import TASKS
 from q2r2_control.viewer.tables import figure_table
 
-DURATION_S, WARM_UP_STEPS = 20.0, 5  # Default duration for each environment [s], and number of steps before it.
+DURATION_S, WARM_UP_STEPS = 20.0, 5  # Default measured time [s], and number of steps before it.
 STEP_RATE_HZ = 20  # Steps per second of simulated time, which is robosuite's default [Hz].
-ACTION_SHARE = 0.1  # Largest action, as a share of the largest allowed one.
+ACTION_SHARE = 0.1  # Largest action, as a share of the largest allowed action.
 
 Environment = tuple[str, Any, Callable[[], Any]]  # Name, environment, and a function that returns a random action.
 
@@ -70,7 +70,7 @@ def main(loop_rate: LoopRate = None, seconds: Seconds = DURATION_S, json: Json =
                 env.step(ACTION_SHARE * action())
             steps, began, computing = 0, time.perf_counter(), time.process_time()
             while (passed := time.perf_counter() - began) < seconds:
-                # These results are robosuite's done, or gymnasium's terminated and truncated.
+                # Here a step gives robosuite's done, or gymnasium's terminated and truncated.
                 if any(env.step(ACTION_SHARE * action())[2:-1]):
                     env.reset()
                 steps += 1

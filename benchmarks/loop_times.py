@@ -1,10 +1,10 @@
-"""Where does the time of a tick of the whole live loop go, stage by stage, with each plant and mode?
+"""How long does each stage of a tick of the whole live loop take, with each plant and mode?
 
 Ticks come at the loop's rate, because a tick would find warmer caches if it followed the last tick at once. Time in the
 run is still simulated, so the arms make the same motion in every round, on a busy machine too. The cases run in turns.
 Rounds that time each stage alternate with rounds that time only the whole tick. In a third kind of round, each tick
-follows the last tick at once. Such rounds show the time of the program itself, because no other program can change the
-caches while the loop sleeps.
+follows the last tick at once. Such rounds show the time of the program itself: the loop does not sleep between ticks,
+so no other program can change the caches.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class Case:
                 self._add("recorded", self._run(folder=Path(folder)))
 
     def rows(self) -> dict[str, Times]:
-        """Return the times by the name of the row."""
+        """Return the times of each row of the table, with the name of the row."""
         found = {what: np.concatenate(times) for what, times in self._times.items()}
         stages = found.pop("stages")
         rows = {stage: Times.of(stages[:, index]) for index, stage in enumerate(STAGES) if stage != PHYSICS}
@@ -190,7 +190,7 @@ def main(
     record: Annotated[bool, typer.Option("--record", help="Also time runs that are recorded.")] = False,
     json: Json = False,
 ) -> None:
-    """Print where the time of a tick of the live loop goes, with a column for each plant and mode."""
+    """Print how long each stage of a tick of the live loop takes, with a column for each plant and mode."""
     config = load_config(DEMO_CONFIG)
     cases = [Case(config, *case, ticks) for case in CASES]
     for turn in range(rounds):

@@ -99,7 +99,7 @@ def measure(name: str, duration: float, crowd: bool) -> RunFigures:
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stderr is not None
-    lines: list[float] = []  # Time when each line came [s].
+    lines: list[float] = []  # Time when each line of the log came [s].
     disturbers: list[Crowd] = []
     for line in process.stderr:
         if (found := re.search(r"page: (http\S+)", line)) is None:
@@ -127,7 +127,7 @@ def measure(name: str, duration: float, crowd: bool) -> RunFigures:
 def main(
     duration: Annotated[float, Option(min=5.0, help="Duration of each run [s].")] = 60.0, json: Json = False
 ) -> None:
-    """Measure a run alone, and one with a crowd on its page."""
+    """Measure a run without clients, and a run with a crowd on its page."""
     figures = [measure("alone", duration, False), measure("with the crowd", duration, True)]
     table = record_table(f"{WATCHERS} watchers and a hostile client on the page of a run", figures, NOTES)
     print_report({"duration_s": duration, "runs": [asdict(each) for each in figures]}, (table,), json)

@@ -1,10 +1,10 @@
-"""Which forces does a finger exert that presses on the table on purpose, in torque mode?
+"""Which forces does a finger exert on the table if it presses on purpose, in torque mode?
 
 The target of the left tool goes straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
-contact allows. It stays there, slides away from the arm's base or towards it while the tool presses, and rises again.
-The slide has one of these two directions because they are the hardest: the arm then moves in its own plane, where its
-masses couple pressing and sliding. The controller and the impedance are those of a usual run. Forces are read from
-MuJoCo's contacts at every tick.
+contact allows. The target stays there, slides away from the arm's base or towards the base while the tool presses, and
+rises again. The slide has one of these two directions because they are the hardest: the arm then moves in its own
+plane, where its masses couple pressing and sliding. The controller and the impedance are as in a usual run. Forces are
+read from MuJoCo's contacts at every tick.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _APPROACH_SPEED = 0.5  # Speed of the target, far above the speed that contact a
 # Times when the tool goes down, slides and is lifted, and when the run ends [s].
 _DOWN_BEGINS_S, _SLIDE_BEGINS_S, _LIFT_BEGINS_S, _RUN_ENDS_S = 2.5, 6.0, 8.5, 10.5
 _APPROACH_S, _SLIDE_S = 2.0, 1.5  # Durations of the approach and of the slide [s].
-_SETTLING_S = 1.0  # Time after the start of a part until its force is steady [s].
+_SETTLING_S = 1.0  # Time from the start of a press until its force is steady [s].
 NOTES = (
     "impact: Speed of the tool at the first touch [m/s], and largest force within the next 0.25 s [N].",
     "steady: Mean force while the tool stays [N].",
@@ -74,7 +74,7 @@ class PressFigures:
     impact_speed: float  # Speed of the tool in the tick before it first touches the table [m/s].
     impact_force: float  # Largest force in the first 0.25 s of contact [N].
     steady_force: float  # Mean force while the tool presses without sliding [N].
-    spring_force: float  # Stiffness times the mean height of the tool above its reference in the same time [N].
+    spring_force: float  # Stiffness times the tool's mean height above its reference during the same time [N].
     largest_force: float  # Largest force of the whole run [N].
     bound: float  # Stiffness times the largest allowed depth of the reference [N].
     bounce_s: float  # Time without contact between the first touch and the slide [s].
@@ -87,8 +87,8 @@ class PressFigures:
     violations: int  # Number of broken promises of the controller, over all ticks.
 
 
-# Direction of the slide, rotor share and friction. The friction is that of metal on wood (0.3), that of the cell (0.6),
-# or that of rubber that grips well (0.9).
+# Direction of the slide, rotor share and friction coefficient. The coefficient is 0.3 (metal on wood), 0.6 (as in the
+# cell), or 0.9 (rubber that grips well).
 PRESSES = (
     *((PressSlide.AWAY, 1.0, friction) for friction in (0.3, 0.6, 0.9)),
     (PressSlide.TOWARDS, 1.0, 0.9),

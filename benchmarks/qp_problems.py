@@ -1,4 +1,4 @@
-"""Which QP solvers solve the controller's problems, as the public qpbenchmark counts it?
+"""How many of the controller's problems does each QP solver solve, by the criteria of the public qpbenchmark?
 
 This file writes the QPs of 2,000 ticks, in which arms move freely, press against each other, run into limits and
 recover. It then prints qpbenchmark's success rates of the installed solvers. The command ``qpbenchmark --results-path
@@ -132,7 +132,7 @@ def solve(test_set: QpProblems, count: int) -> qpbenchmark.Results:
             for settings, by_solver in test_set.solver_settings.items():
                 rows.append(_row(problem, solver, settings, by_solver[solver]))
     results = qpbenchmark.Results(None, test_set)
-    # All rows are added at once, because ``update`` copies all earlier rows for each new one.
+    # All rows are added at once, because ``update`` copies all earlier rows for each new row.
     results.df = pandas.DataFrame(rows)
     return results
 
@@ -154,7 +154,7 @@ def _row(problem: qpbenchmark.Problem, solver: str, settings: str, options: Mapp
 
 
 def success_rates(results: qpbenchmark.Results) -> pandas.DataFrame:
-    """Return the percentage of solved problems by solver and settings, as qpbenchmark's reports have it."""
+    """Return the percentage of solved problems by solver and settings, as it is in qpbenchmark's reports."""
     tolerances = results.test_set.tolerances
     by_kind = [
         {name: getattr(tolerance, kind) for name, tolerance in tolerances.items()} for kind in ("primal", "dual", "gap")

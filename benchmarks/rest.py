@@ -28,7 +28,7 @@ DT = 0.001  # Period of a tick [s].
 # Arms count as resting if this acceleration is not larger: the RMS, over the last 0.5 s, of the norm of all joints'
 # accelerations [rad/s^2].
 MAX_REST_ACCELERATION = 0.1
-# Jolts are counted after this time [s]. By then, the jump of the targets has no more effect, and the arms slide.
+# Jolts are counted after this time [s], when the jump of the targets has no more effect and the arms slide.
 JOLTS_COUNT_AFTER_S = 2.0
 NOTES = (
     f"Targets stay constant for {DURATION_S:g} s. Most of them cannot be reached with every distance kept.",
@@ -39,8 +39,8 @@ NOTES = (
     "fallback ticks: Number of ticks of all runs in which the certified stop was executed.",
 )
 
-# By the kind of runs, the lower and upper bounds of the left tool's target (x, y, z), measured from the middle between
-# both tools at home [m]. For the right tool, y has the opposite sign.
+# For each kind of runs: the lower and upper bounds of the left tool's target (x, y, z), measured from the middle
+# between both tools at home [m]. For the right tool, y has the opposite sign.
 KINDS: dict[str, tuple[Array, Array]] = {
     "anywhere": (np.array([-0.25, -0.35, -0.3]), np.array([0.25, 0.35, 0.3])),
     "other side": (np.array([-0.2, -0.35, -0.15]), np.array([0.2, 0.0, 0.3])),
@@ -58,7 +58,7 @@ class RestFigures:
     at_rest: int  # Number of runs whose arms rest at the end.
     # The acceleration of a run is the RMS, over the last 0.5 s, of the norm of all joints' accelerations [rad/s^2].
     median_acceleration: float  # Median over the runs [rad/s^2].
-    worst_acceleration: float  # Largest of all runs [rad/s^2].
+    worst_acceleration: float  # Largest acceleration of any run [rad/s^2].
     # Mean number of ticks of a run after JOLTS_COUNT_AFTER_S in which an acceleration changes by more than JOLT.
     jolts: float
     most_jolts: int  # Largest number of such ticks in one run.
@@ -98,7 +98,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS_PER_KIND) -> list[RestF
 
 
 def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[str, pin.SE3]:
-    """Return a random target pose for each tool. Its rotation differs a little from the tool's rotation at home."""
+    """Return a random target pose for each tool. The rotation of a target is near the tool's rotation at home."""
     home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     middle = np.mean([pose.translation for pose in home.values()], axis=0)
     targets = {}

@@ -39,7 +39,7 @@ _SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_c
 
 
 # A command with more than this share of the acceleration limit is an answer. A step causes an acceleration at the whole
-# limit. The rest of the motion that the step before has caused needs only a tenth of the limit by then.
+# limit. At that time, the motion that the previous step has caused needs only a tenth of the limit.
 _ANSWER_SHARE = 0.4
 
 
@@ -55,7 +55,7 @@ class CommandRecording:
 
 @dataclass(frozen=True, slots=True)
 class LatencyRow:
-    """The latencies of one input, from the step until the command was received. They are None without any answer."""
+    """The latencies of one input, from the step until the command was received. None if no step was answered."""
 
     path: str  # Names of the first and the last topic.
     steps: int  # Number of steps.
@@ -117,7 +117,7 @@ class _Probe:
         self._node = rclpy.create_node("latency_probe", context=self._context)
         self._commands: list[tuple[float, float, list[float]]] = []
         self._tool: PoseStamped | None = None
-        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        # ``listen`` has the type Any, because rclpy's type hints lack callbacks that get the message's stamps.
         listen: Any = self._on_command
         self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
         self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
@@ -180,7 +180,7 @@ class _Probe:
         while time.monotonic() < end:
             beside()
             message.pose.position.z = height + _STEP_SIZE * (len(steps) % 2)
-            steps.append(time.time())  # This is the clock of the middleware's stamps.
+            steps.append(time.time())  # The middleware's stamps have the same clock.
             publisher.publish(message)
             self._spin(random.uniform(*_STEP_PAUSES_S))
         if not self._commands:
@@ -238,7 +238,8 @@ def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[s
 def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
     """Find the answer to each step, as the module's docstring defines it, and return the latencies."""
     times = np.asarray(recording.sent)
-    # Ticks may be early or late, so each change of velocity is compared with its own dt, at least half the usual dt.
+    # Ticks may be early or late, so each change of velocity is divided by the real time between its two commands. This
+    # time counts as at least half of the median time, because a very short time would give a high acceleration.
     dt = np.diff(times)
     change = np.abs(np.diff(recording.v, axis=0) / acceleration_limit).max(axis=1)
     answering = np.concatenate([[False], change > _ANSWER_SHARE * np.maximum(dt, 0.5 * np.median(dt))])

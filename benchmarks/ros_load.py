@@ -27,10 +27,10 @@ from q2r2_control.viewer.tables import figure_table
 from ros_processes import private_domain, processor_time, started
 
 _START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
-_SETTLING_S = 3.0  # Time to wait after the nodes have started, and again after the hands have [s].
+_SETTLING_S = 3.0  # Time to wait after the nodes have started, and again after the hands have started [s].
 _SAMPLE_JITTER_S = 0.002  # Largest random delay of a headset's sample [s].
 _TREND_WINDOW_S = 0.15  # Width of the window that separates the hand's own slow motion from faster ripple [s].
-_NODES_WITH_RATE = "mujoco_robot", "cartesian_controller"  # Nodes whose rate is set.
+_NODES_WITH_RATE = "mujoco_robot", "cartesian_controller"  # Nodes that run at the rate of the command line.
 _SCRIPTED_HANDS = NodeProcess("SimulationInput", {"jitter": _SAMPLE_JITTER_S})
 
 
@@ -51,7 +51,7 @@ class LoadReport:
     jitter: float  # Largest random delay of a hand's sample [s].
     rows: tuple[NodeLoad, ...]
     commands_hz: float  # Number of joint commands per second.
-    # RMS of the commanded joint speeds about their trend, as a share of the trend's RMS, as a robot receives them.
+    # The result of speed_ripple for the commands, at the times at which a robot follows them.
     speed_ripple: float
 
     @property
@@ -65,10 +65,10 @@ class LoadError(Q2R2Error):
 
 
 def speed_ripple(times: Array, q: Array) -> float:
-    """Return the RMS of the joint speeds about their trend, as a share of the trend's RMS.
+    """Return the RMS of the differences between joint speeds and their trend, divided by the trend's RMS.
 
-    The speeds are those between the joint positions ``q`` (n, nv) [rad] at the ascending ``times`` (n,) [s]. The trend
-    is a mean over 0.15 s, weighted by a Hann window.
+    The speeds are computed from the joint positions ``q`` (n, nv) [rad] at the ascending ``times`` (n,) [s]. The trend
+    is a mean of the speeds over 0.15 s, weighted by a Hann window.
     """
     dt = np.diff(times)
     v = np.diff(q, axis=0) / dt[:, None]
@@ -82,8 +82,8 @@ def speed_ripple(times: Array, q: Array) -> float:
 def measure_load(config: str, duration: float, rate: float) -> LoadReport:
     """Measure for ``duration`` [s] at rest, and for the same time with both arms moving.
 
-    ``rate`` is that of robot and controller [Hz]. Raises :class:`LoadError` if a node does not start in time or an arm
-    is paused.
+    The nodes of the robot and of the controller run at ``rate`` [Hz]. Raises :class:`LoadError` if a node does not
+    start in time or an arm is paused.
     """
     nodes, arms = nodes_of(config, "none"), len(load_config(config).arms)
     nodes = [
@@ -111,18 +111,18 @@ def measure_load(config: str, duration: float, rate: float) -> LoadReport:
 
 
 class _Watcher:
-    """A node that listens to the nodes' states, and to joint commands with the middleware's stamps of the sender."""
+    """A node that listens to the nodes' states, and to joint commands with the times at which they were published."""
 
     def __init__(self) -> None:
         self.active = False  # True if the controller is active.
-        self.engaged: dict[str, bool] = {}  # By arm, True if it is engaged.
+        self.engaged: dict[str, bool] = {}  # True for each arm that is engaged.
         self.last_event: dict[str, str] = {}  # Last event of each arm.
         self._commands: list[tuple[int, bytes]] = []  # Time [ns] and serialized message of each command.
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("load_watcher", context=self._context)
         # Messages are read after the run, because reading them at once would take as much time as a node takes.
-        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        # ``listen`` has the type Any, because rclpy's type hints lack callbacks that get the message's stamps.
         listen: Any = self._on_command
         qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
         node: Any = self._node

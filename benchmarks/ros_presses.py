@@ -1,7 +1,7 @@
-"""How long does it take from a press until the arm moves, for the first press after the nodes are ready and for others?
+"""How long does it take from a press until the arm moves, for the first press after the nodes start and for later ones?
 
 All nodes are started again for each first press. The hand always goes round a circle, so an engaged arm moves at once.
-Each tick of the arm's node ends with its flags, which the node publishes for recorders.
+At the end of each tick, the arm's node publishes its flags for recorders, so these messages show when its ticks end.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class PressRecording:
     ticks: Sequence[float]  # Time when each tick of the arm's node ended. Some are before the press.
     targets: Sequence[float]  # Time when each target was published.
     commands: Sequence[float]  # Time when each joint command was published.
-    speeds: Sequence[float]  # Speed of the fastest joint of each joint command [rad/s].
+    speeds: Sequence[float]  # Speed of the fastest joint in each joint command [rad/s].
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +61,12 @@ class PressRow:
 
     press: str  # Kind of the presses.
     count: int  # Number of presses.
-    unanswered: int  # Number of presses that nothing answered within half a second.
+    unanswered: int  # Number of presses without an answer within half a second.
     tick_p50_ms: float | None  # Longest time between two ticks of the arm's node in the half second after a press.
     tick_max_ms: float | None
     target_p50_ms: float | None  # Time from a press until the first target.
     target_max_ms: float | None
-    motion_p50_ms: float | None  # Time from a press until the first joint command that moves.
+    motion_p50_ms: float | None  # Time from a press until the first joint command of a motion.
     motion_max_ms: float | None
 
 
@@ -84,7 +84,7 @@ class PressError(Q2R2Error):
 
 
 def measure_presses(config: str, starts: int) -> PressReport:
-    """Press for the first time and four times more, at each of ``starts`` starts of the nodes.
+    """Start the nodes ``starts`` times. After each start, press for the first time, and then four times more.
 
     Raises :class:`PressError` if the nodes are not ready in time.
     """
@@ -118,7 +118,7 @@ class _Hand:
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("press_probe", context=self._context)
-        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        # ``listen`` has the type Any, because rclpy's type hints lack callbacks that get the message's stamps.
         listen: Any = self._node.create_subscription
         listen(Float64MultiArray, arm_flags("left"), self._on_flags, RECORDED_QOS)
         listen(PoseStamped, asked_target("left"), self._on_target, RECORDED_QOS)
@@ -152,7 +152,7 @@ class _Hand:
         """Press, and record what follows for longer than :data:`WATCHED_S`."""
         for times in (self._ticks, self._targets, self._commands, self._speeds):
             del times[:-1]
-        press = time.time()  # This is the clock of the middleware's stamps.
+        press = time.time()  # The middleware's stamps have the same clock.
         self._press()
         return PressRecording(
             press, tuple(self._ticks), tuple(self._targets), tuple(self._commands), tuple(self._speeds)

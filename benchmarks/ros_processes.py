@@ -17,7 +17,7 @@ from q2r2_control.ros.launch.processes import NodeProcess
 
 @contextmanager
 def private_domain() -> Iterator[None]:
-    """Use a ROS domain of its own on this host, so no message reaches a robot on the network or comes from one."""
+    """Use a free ROS domain of this host only. Thus no message goes to a robot on the network or comes from it."""
     with domain_coordinator.domain_id() as number:
         private = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         before = dict(os.environ)

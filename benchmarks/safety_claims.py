@@ -14,7 +14,7 @@ class Mutation(NamedTuple):
     """A change that breaks one line. ``old`` occurs exactly once in the file."""
 
     claim: str
-    file: str  # Path from SAFETY, or from the repository's root if it contains a folder.
+    file: str  # The name of a file in the folder SAFETY, or a path from the repository's root that has a slash.
     old: str
     new: str
 

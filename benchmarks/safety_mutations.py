@@ -23,7 +23,7 @@ from safety_claims import CERTIFICATE, SAFETY, Mutation
 
 ROOT = Path(__file__).resolve().parents[1]
 MUTATIONS = (*CERTIFICATE, *CONTROL, *AGES, *WATCHES, *TWO_ARMS, *COMMANDS)
-TESTS = {  # By the folder of a row's line, the tests that run for the row.
+TESTS = {  # For each folder: the tests that run if the line of a row is in this folder.
     SAFETY: (
         "tests/control/safety",
         "tests/control/test_contract.py",

@@ -1,6 +1,6 @@
 """How long does it take from a controller's motion to the joint command, through a browser and its page?
 
-Meta's iwer emulates a headset in Chromium, and the run is that of q2r2 run --input webxr. A controller jumps by 5 mm
+Meta's iwer emulates a headset in Chromium. Everything else is as in q2r2 run --input webxr. A controller jumps by 5 mm
 at random times. The latency is the time from a jump to the first joint command that differs from the command before the
 jump. The page measures the time of the jump, and the run measures the time of the command, on the same computer. The
 latency includes the wait for the headset's next frame, which takes half a frame on average.
@@ -29,8 +29,8 @@ from q2r2_control.viewer.tables import record_table
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_MIN_MOTION = 1e-6  # Least difference of a command that has moved [rad].
-_MAX_LATENCY_S = 0.5  # Longest time from a jump to its command [s].
+_MIN_MOTION = 1e-6  # A command differs from an earlier command if a joint differs by more than this [rad].
+_MAX_LATENCY_S = 0.5  # The first command that differs is searched for during this time after a jump [s].
 
 # A script for the page. Its function jump moves the left controller, and returns the wall clock's time of each jump and
 # the mean time of a frame, both in [s].

@@ -20,7 +20,8 @@ from q2r2_control.types import SIDES, HandInputs
 
 # Time when each hand presses. The times differ, because nobody presses with both hands at the same instant [s].
 _PRESS_TIMES_S = {"left": 0.2, "right": 0.26}
-# Time when the hands begin to move. It is half a second after both presses count, including the wait for a chord [s].
+# Time when the hands begin to move [s]. A press counts only after the wait for a chord, which is a press of two
+# buttons. The hands begin half a second after both presses count.
 MOTION_BEGINS_S = 1.0
 _EVEN_RATE_HZ = 75.0  # Rate of even samples [Hz].
 _SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].

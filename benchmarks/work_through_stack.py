@@ -51,8 +51,8 @@ class StackFigures:
     max_error_mm: float | None = None  # Largest error of either tool, until the hands rest.
     path_error_mm: float | None = None  # RMS error from the pose that the hand asked for one filter delay earlier.
     end_error_mm: float | None = None  # Largest error of either tool at the end.
-    # Time from the end of the approach until both tools stay within 10 mm of the goal. None if they do not, or if the
-    # motion has no goal.
+    # Time from the end of the approach until both tools stay within 10 mm of the goal. None if they do not stay
+    # there, or if the motion has no goal.
     arrival_s: float | None = None
     fallback_percent: float | None = None  # Percentage of ticks in which the certified stop was executed.
     measured_distance_mm: float | None = None  # Least distance of a monitored pair at measured postures, from Coal.
@@ -61,7 +61,7 @@ class StackFigures:
     reference_distance_mm: float | None = None  # Least distance of a monitored pair at the reference's postures.
     max_acceleration_ratio: float | None = None  # Largest acceleration of the reference, divided by the joint's limit.
     max_torque_ratio: float | None = None  # Largest motor torque, divided by the limit at which the motor saturates.
-    # RMS over the last 0.5 s of the norm over the joints of the reference's acceleration [rad/s^2].
+    # RMS, over the last 0.5 s, of the norm of the accelerations of all joints in the reference [rad/s^2].
     rest_acceleration: float | None = None
     slip_mm: float = 0.0  # Largest distance by which the leash moved a target.
     pauses: list[str] = field(default_factory=list)  # Reasons why an arm was paused during the run.

@@ -37,5 +37,5 @@ def follow(message: PoseStamped) -> None:
 TOPIC = "/cartesian_controller/safe_target/left"
 node.create_subscription(PoseStamped, TOPIC, follow, qos_profile_sensor_data)
 print(f"waits for targets on {TOPIC}", flush=True)
-with suppress(KeyboardInterrupt, ExternalShutdownException):  # These end the node.
+with suppress(KeyboardInterrupt, ExternalShutdownException):  # These exceptions end the node without a traceback.
     rclpy.spin(node)

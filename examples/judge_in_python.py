@@ -18,7 +18,7 @@ def record(folder: str) -> Path:
 
 with tempfile.TemporaryDirectory() as folder:
     given = [Path(path) for path in sys.argv[1:]] or [record(folder)]
-    # These are thresholds of your own. Without this argument, the thresholds of the recorded cell count.
+    # These are thresholds of your own. Without ``settings``, judge_all uses the thresholds of the recorded cell.
     settings = JudgeSettings(max_position_error_rms=0.02, max_idle_share=0.95)
     for judged in judge_all(recordings_in(given), settings):
         if isinstance(judged, Unreadable):

@@ -13,7 +13,7 @@ start = controller.tool_pose("left")
 for tick in range(6000):
     t = 0.001 * tick
     if tick % 33 == 0:  # A camera would report the hand about 30 times per second.
-        away = 0.15 + 0.6 * abs(t / 3.0 - 1.0)  # The hand comes from 0.75 m to 0.15 m at 3 s, and returns at 0.2 m/s.
+        away = 0.15 + 0.6 * abs(t / 3.0 - 1.0)  # At 0.2 m/s, the hand comes from 0.75 m to 0.15 m and goes away.
         place = start.translation + np.array([0.0, away, 0.0])
         hand = MovingObstacle(shape="sphere", size=(0.1,), position=tuple(place.tolist()), speed=0.25)
         controller.move_obstacle("hand", hand)

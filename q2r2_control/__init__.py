@@ -1,6 +1,6 @@
 """Bimanual VR teleoperation and Cartesian control with a safe QP controller.
 
-The names of this package are the fixed API, and so are those of the sub-packages that ``docs/api.md`` lists:
+The names of this package are the fixed API, and so are the names of the sub-packages that ``docs/api.md`` lists:
 ``inputs``, ``plants``, ``process``, ``recording``, ``export``, ``judging``, ``demo``, ``viewer``, ``gym`` and ``ros``.
 Everything else may move between versions. A name is imported when it is first used, so that a ROS node that only passes
 messages on need not wait for the solver and its compiled kernels.

@@ -11,7 +11,8 @@ from typing import Any
 def lazy_exports(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the functions ``__getattr__`` and ``__dir__`` of a ``package``.
 
-    ``modules`` maps each name to the module that has it: "scripted" in the package, ".types" beside the package.
+    ``modules`` maps each name to its module, such as "scripted" for a module in the package, or ".types" for a module
+    beside the package.
     """
 
     def getattr_of_package(name: str) -> Any:

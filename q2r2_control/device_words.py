@@ -12,13 +12,13 @@ class DeviceWords:
     """Words of one device. A control without a noun is called by its name in the cell's bindings."""
 
     nouns: Mapping[str, str] = field(default_factory=dict, hash=False)  # Nouns by control.
-    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # The verb by control, if not "press" or "hold".
+    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # Verbs of controls, if not "press" or "hold".
     # Text while no device is connected; empty if the device's own controls connect it.
     absent: str = "nothing: no input is connected"
     nobody: str = ""  # Why no person presses anything; empty if a person does.
 
     def noun(self, control: str) -> str:
-        """Return the operator's word for the name ``control``, which `` held`` or `` button`` may follow."""
+        """Return ``control`` with the operator's noun instead of its name. "held" or "button" may follow the name."""
         return re.sub(r"^(\w+)( button)?", lambda found: self.nouns.get(found[1], found[0]), control)
 
     def press(self, control: str) -> str:

@@ -108,8 +108,8 @@ class Event:
 
     t: float  # Time of the event [s].
     arm: str
-    source: str  # The state before.
-    destination: str  # The state after.
+    source: str  # The arm's state before the event.
+    destination: str  # The arm's state after the event.
     reason: Reason
 
     @property

@@ -49,7 +49,7 @@ def points_of(group: str) -> Mapping[str, EntryPoint]:
 
 @lru_cache(maxsize=32)
 def _points(group: str, folders: tuple[tuple[str, int], ...]) -> Mapping[str, EntryPoint]:
-    """Return the entry points of a group. ``folders`` are those of ``sys.path``, with their times of change [ns]."""
+    """Return the entry points of a group. ``folders`` are all folders of ``sys.path``, with times of change [ns]."""
     return {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
 
 

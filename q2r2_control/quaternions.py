@@ -52,7 +52,7 @@ def rotation_vector(q: Quaternion) -> Vector:
 
 
 def turn_between(start: Quaternion, end: Quaternion) -> Vector:
-    """Return the rotation vector that leads from ``start`` to ``end``, of at most half a turn [rad]."""
+    """Return the rotation vector of the rotation from ``start`` to ``end``, of at most half a turn [rad]."""
     a, b, c, d = end
     x, y, z, w = start
     a, b, c, cosine = (

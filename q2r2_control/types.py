@@ -102,16 +102,16 @@ class HandFault(StrEnum):
     """Faults of a hand whose pose alone looks valid. The values are kinds of :mod:`events`."""
 
     FROZEN = "hand_frozen"
-    FRAME_MOVED = "hand_frame_moved"  # Both hands moved as one, so that their frame has probably moved.
-    UNTRACKED = "hand_untracked"  # The headset reports no pose, or says that it is a guess.
+    FRAME_MOVED = "hand_frame_moved"  # Both hands moved together, so their frame has probably moved.
+    UNTRACKED = "hand_untracked"  # The headset reports no pose, or reports that its pose is a guess.
 
 
 @dataclass(frozen=True, slots=True)
 class HandSample:
     """One reading of one hand, as it was received. Nothing has been checked or normalised yet.
 
-    The pose and the controls arrive in separate messages. Each has its own time of receipt, so that a stream that stops
-    is noticed.
+    The pose and the controls arrive in separate messages. Pose and controls have separate times of receipt, so that the
+    stop of one stream is noticed.
     """
 
     hand: str
@@ -161,7 +161,8 @@ class Command:
     """A command for the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
-    q: Array  # (nv,) Joint positions [rad]. In velocity and torque mode, the reference, for plants that show it.
+    # (nv,) Joint positions [rad]. In velocity and torque mode, they are the reference, which a plant may show.
+    q: Array
     v: Array  # (nv,) Joint velocities [rad/s].
     tau: Array  # (nv,) The commanded joint torques in torque mode [Nm].
     grippers: dict[str, float]  # Openings by arm, from 0 for closed to 1 for fully open.
@@ -177,7 +178,7 @@ class ObservedPicture(Protocol):
 
     @property
     def time(self) -> float:
-        """The time of its capture, by the loop's clock [s]."""
+        """The time at which the picture was captured, by the loop's clock [s]."""
 
     @property
     def pixels(self) -> npt.NDArray[np.uint8]:
@@ -190,7 +191,7 @@ class Observation:
 
     time: float  # Time of the loop's clock [s].
     state: RobotState  # Measured before the command of the tick.
-    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only of arms that measure it.
+    openings: Mapping[str, float]  # Measured openings by arm, 0 closed .. 1 open, of arms that measure them.
     tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
     # The newest picture of each camera of the cell. If a camera gives no picture, reading it raises CameraError.
     pictures: Mapping[str, ObservedPicture] = field(default_factory=dict)
@@ -202,11 +203,11 @@ class ActionChunk:
 
     times: Array  # (n,) Ascending times of the loop's clock [s].
     period: float  # Time from one action to the next [s]. It is also given for a single action.
-    tools: Mapping[str, Array] = field(default_factory=dict)  # By arm (n, 7): x y z qx qy qz qw in the world frame.
-    # By arm (n, 6): translation [m] and rotation vector [rad], in the frame of the target before.
+    tools: Mapping[str, Array] = field(default_factory=dict)  # (n, 7) for each arm: x y z qx qy qz qw in the world.
+    # (n, 6) for each arm: translation [m] and rotation vector [rad], in the frame of the previous target.
     motions: Mapping[str, Array] = field(default_factory=dict)
-    grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings, 0 closed .. 1 fully open.
-    postures: Array | None = None  # (n, nv) Positions of all joints, used where the tool poses leave them free [rad].
+    grippers: Mapping[str, Array] = field(default_factory=dict)  # (n,) for each arm: openings, 0 closed .. 1 open.
+    postures: Array | None = None  # (n, nv) Joint positions that are wanted as far as the tools leave them free [rad].
     fault: Reason | None = None  # Why the actions are not usable; None if they are.
 
     def as_json(self) -> dict[str, Any]:
@@ -285,7 +286,7 @@ class StepReport:
     closest_distance: float  # Distance of the closest pair [m].
     certified: bool  # Whether a stop is known that keeps all limits and distances.
     fallback: bool  # Whether the certified stop was executed, at least in part.
-    slack: float  # Largest violation of a row of unit norm [rad/s].
+    slack: float  # Largest violation of a row of the QP [rad/s]. All rows have unit norm.
     solve_time: float  # Time of the solver [s]; 0 if the solver was not needed.
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
     margin: float = math.inf  # Distance of that pair minus the distance that it has to keep [m].
@@ -311,10 +312,10 @@ class Reference:
 class ArmTarget:
     """The target of one arm from the teleop layer."""
 
-    pose: pin.SE3 | None  # Target of the tool in the world frame; None lets the arm hold.
+    pose: pin.SE3 | None  # Target of the tool in the world frame; None if the arm has to hold its reference.
     gripper: float  # Opening, from 0 for closed to 1 for fully open.
     slip: float = 0.0  # Distance by which leash and workspace have held the target back since engaging [m].
-    slip_angle: float = 0.0  # The same for the rotation [rad].
+    slip_angle: float = 0.0  # Angle by which leash and workspace have held the target back since engaging [rad].
     offset: Array | None = None  # (3,) Measured minus commanded tool position when engaged [m]; None if not known.
     filtered_hand: Pose | None = None  # The filtered pose of the hand from which the target was computed.
     posture: Array | None = None  # (nv,) Posture that a policy wants, as far as the tool leaves it free [rad].
@@ -342,11 +343,11 @@ class ArmTiming:
     """The timing of one arm relative to the reference that it follows. All times are in seconds."""
 
     behind: float | None  # Lag that the arm's newest message reports; None if the lag is measured instead.
-    silent: float  # Time since that message.
+    silent: float  # Time since the arm's newest message.
     period: float  # Usual time between two messages.
     noise: float = 0.0  # Noise of ``behind``.
 
     @property
     def lag(self) -> float:
-        """The greatest possible lag of the arm now. While its next message is missing, the arm may stand still."""
+        """The greatest possible lag of the arm now. It grows with ``silent``, because a silent arm may stand still."""
         return (self.behind or 0.0) + max(self.silent - self.period, 0.0)

@@ -32,7 +32,7 @@ def sentence(reason: Reason, words: DeviceWords | None = None) -> str:
 
 
 def _text(value: Any) -> Any:
-    """Return a list as its names, and a mapping as JSON. Numbers stay, since the sentence's template formats them."""
+    """Return a list as text ("a and b"), a mapping as JSON, and other values unchanged. The template formats them."""
     if isinstance(value, Mapping):
         return json.dumps(value)
     return " and ".join(map(str, value)) if isinstance(value, list | tuple) else value

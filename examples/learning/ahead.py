@@ -1,10 +1,10 @@
-"""Give each frame of a LeRobotDataset the action of a later frame, as a policy should learn it.
+"""Give each frame of a LeRobotDataset the action of a later frame, so that a policy learns the action that comes next.
 
     python examples/learning/ahead.py datasets/circle datasets/circle_ahead [--frames 1]
 
-This is for datasets of lerobot-record, which has no option for it. For q2r2 export, use its option --ahead instead. The
-first actions of an episode are dropped, and its last action is repeated. Only these few actions differ, so the
-statistics of the dataset are not computed again.
+This script is for datasets of lerobot-record, which has no option for such actions. For q2r2 export, use its option
+--ahead instead. The first actions of an episode are dropped, and its last action is repeated. Only these few actions
+differ, so the statistics of the dataset are not computed again.
 """
 
 from __future__ import annotations

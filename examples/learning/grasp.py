@@ -153,7 +153,7 @@ def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
     stats = dataset.meta.stats | {ACTION: scale}
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     ends = torch.from_numpy(np.repeat(dataset.meta.episodes["dataset_to_index"], dataset.meta.episodes["length"]))
-    # The policy is only called in the first second of an episode, so it learns from these frames.
+    # The policy is only called in the first second of an episode, so it learns only from the frames of this second.
     begins = torch.from_numpy(np.flatnonzero(column(dataset, "frame_index") < FPS))
     optimizer = torch.optim.AdamW(policy.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)

@@ -1,8 +1,8 @@
 """Run one controller in one work motion and compute its figures, or run our controller and its peers in all motions.
 
 All controllers run in one process, and get the same cell, limits, targets and ticks. Peers run open loop, as our
-controller does. A peer gets its targets earlier by its lag. Our controller also runs in free air, where no pairs are
-monitored. The difference between its two runs is the cost of the monitored pairs.
+controller does. Each peer lags behind its targets, so it gets them earlier by this lag. Our controller also runs in
+free air, where no pairs are monitored. The difference between its two runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class OwnController:
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
-        """Return the same positions at rest. It is called only after a step that raised, which the contract forbids."""
+        """Return the same positions at rest. This is called only after an exception, which our contract forbids."""
         reference = self._controller.step({}, _SHORTEST_DT)
         return reference.q, np.zeros_like(reference.v)
 
@@ -102,16 +102,16 @@ class MotionFigures:
     motion: str
     controller: str
     done: float  # Share of the motion's ticks that were run; less than 1 if the controller was too slow.
-    ticks: int = 0  # Measured ticks.
-    failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
-    # Errors are distances between the tools and their targets. The first two do not count the rest at the end.
+    ticks: int = 0  # Number of measured ticks.
+    failures: int = 0  # Number of measured ticks with an exception, no solution, or numbers that are not finite.
+    # Errors are distances between tools and targets. rms_error_mm and max_error_mm do not count the rest at the end.
     rms_error_mm: float | None = None  # RMS error of the tool whose RMS error is larger.
     max_error_mm: float | None = None  # Largest error of either tool.
     end_error_mm: float | None = None  # Error in the last tick, of the tool whose error is larger.
     # Time from the beginning of the motion until both tools stay within 10 mm of the goal. None if they do not stay
     # there until the end, or if the motion has no goal.
     arrival_s: float | None = None
-    fallback_percent: float | None = None  # Share of ticks with the certified stop; None for a peer, which has none.
+    fallback_percent: float | None = None  # Percentage of ticks with a certified stop; None for a peer.
     min_distance_mm: float | None = None  # Least distance of the monitored pairs, computed by Coal.
     closest_pair: tuple[str, str] | None = None
     max_acceleration: float | None = None  # Largest acceleration of a joint [rad/s^2].
@@ -220,9 +220,9 @@ def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tup
 
 
 def arrival_time(to_goal: Array, dt: float) -> float | None:
-    """Return the time after which both tools stay at their goals [s]; None if one is away from its goal at the end.
+    """Return the time after which both tools stay at their goals [s]; None if a tool is not there at the end.
 
-    ``to_goal`` (n, arms) are their distances from the goals in ticks of ``dt`` [s].
+    ``to_goal`` (n, arms) are the tools' distances from their goals [m], in ticks of ``dt`` [s].
     """
     away = np.flatnonzero((to_goal >= ARRIVED).any(axis=1))
     first = int(away[-1]) + 1 if len(away) else 0
@@ -274,7 +274,7 @@ def run_bench(
 
     The ``motions`` have to be made for the cell ``config``, such as ``config/dual_iiwa7.yaml``. The speed of a machine
     varies, so the controllers run one after the other, and this is repeated for ``rounds`` rounds. Computing times are
-    the medians over the rounds. All other figures are those of the last round.
+    the medians over the rounds. All other figures come from the last round.
     """
     robot = Robot.from_config(config)
     free = OwnController(without_pairs(config), config, "free air")

@@ -1,4 +1,4 @@
-"""Run the same motion with one QP solver after another, in one process. Compare times and motions with those of DAQP.
+"""Run the same motion with one QP solver after another, in one process. Compare its times and motions with DAQP's.
 
 The motion is the contact motion of the bench. Both tools are sent to positions that they cannot reach. Therefore rows
 and box of the QP are active at nearly every tick. All solvers get the same cell, targets and ticks, and no time limit.
@@ -30,7 +30,7 @@ class SolverFigures:
     """The figures of one solver in the motion."""
 
     solver: str
-    unsolved_percent: float  # Share of ticks with an unsolved QP.
+    unsolved_percent: float  # Percentage of ticks with an unsolved QP.
     # Largest distance, in any tick, between a tool's positions with this solver and with DAQP; None without ticks.
     off_daqp_mm: float | None
     motion: MotionFigures

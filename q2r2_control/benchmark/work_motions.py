@@ -5,7 +5,7 @@ every controller can get the same targets. Each motion begins with an approach f
 for :data:`REST`. Tools point straight down and keep this rotation, unless the motion says otherwise.
 
 If both tools point down at equal heights, 0.18 m apart, the wrists are 20 mm apart. A tool that points down can reach
-0.73 m from its arm's mount, at a height of 0.38 m above the mount. If its tool points down, no arm reaches the home
+0.73 m from its arm's mount, at a height of 0.38 m above the mount. An arm whose tool points down cannot reach the home
 position of the other arm's tool.
 """
 
@@ -44,9 +44,9 @@ class WorkMotion:
     path: Path
     # Positions (2, 3) through which the tools move from home [m]. The motion starts at the last of them.
     approach: tuple[Array, ...] = ()
-    # The angle by which each tool turns about the world's x axis during the approach [rad]. It keeps this angle.
+    # The angle by which each tool turns about the world's x axis during the approach [rad]. The tool keeps this angle.
     tilt: tuple[float, float] = (0.0, 0.0)
-    has_goal: bool = False  # Whether the purpose is to arrive at the last targets.
+    has_goal: bool = False  # Whether both tools have to arrive at the last targets.
     reachable: bool = True  # Whether both arms can reach all targets with every distance kept.
     rest: float = REST  # Duration of the constant targets at the end [s].
 
@@ -113,7 +113,7 @@ def _to(
 ) -> WorkMotion:
     """Return a motion with a goal, in which both tools move straight from stop to stop.
 
-    Each item of ``stops`` is the time of travel to the stop [s], and the stop.
+    Each item of ``stops`` has the time of travel to a stop [s], and the stop.
     """
 
     def path(t: float, home: Array) -> Array:
@@ -143,7 +143,8 @@ def _uniform(t: float, length: float, speed: float, ramp: float) -> float:
     return speed * (t - 0.5 * ramp)
 
 
-_CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # Centre x and z, radius in x, rise in z [m].
+# For the laps: x of the centre and lowest z [m], amplitude in x [m], and amplitude in z [m].
+_CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04
 _CARRY_RAMP = 0.5  # Time to reach the speed, and time to stop [s].
 _LEAST_GAP = 0.18  # If tools are at equal heights and this far apart, the wrists are 20 mm apart [m].
 
@@ -173,7 +174,7 @@ def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
 
 
 def _between_tools(home: Array, gap: float) -> Array:
-    """Return the ``home`` positions of both tools (2, 3) [m], moved sideways to ``gap`` [m] around the middle."""
+    """Return the ``home`` positions of both tools (2, 3) [m], moved sideways until they are ``gap`` [m] apart."""
     return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
@@ -223,7 +224,7 @@ _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 
 
 def _slide(t: float, home: Array) -> Array:
-    """Return a left target that slides sideways over the table, and a right target that rests away from it (2, 3)."""
+    """Return a left target that slides sideways over the table, and a right target at rest beside its path (2, 3)."""
     y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_LENGTH, _SLIDE_SPEED, _SLIDE_RAMP)
     return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 

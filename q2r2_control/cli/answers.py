@@ -35,7 +35,11 @@ class RememberedAnswers:
         return bool(self._answers)
 
     def ask(self, question: str, usual: Answer) -> Answer:
-        """Ask a question, and return the answer. Enter alone takes the answer of the earlier try, or else ``usual``."""
+        """Ask a question, and return the answer.
+
+        If the user presses only Enter, the answer of the earlier try is taken, or ``usual`` if there was no earlier
+        try.
+        """
         if self._yes:
             return usual
         earlier = self._answers.get(question)
@@ -54,7 +58,7 @@ class RememberedAnswers:
             self._keep()
 
     def forget(self) -> None:
-        """Remove the file, because the command succeeded. With ``yes`` it stays, because it was not used."""
+        """Remove the file, because the command succeeded. With ``yes``, the file stays, because it was not used."""
         if not self._yes:
             with suppress(OSError):
                 self.file.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The ``q2r2`` command, with everything that its subcommands share. The module ``commands`` has their table."""
+"""The ``q2r2`` command, with everything that its subcommands share. The module ``commands`` lists the subcommands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.errors import Q2R2Error
 # Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of both.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
-_PARTS = "q2r2_control."  # The names of this package's modules begin with this. An installation may lack some of them.
+_PARTS = "q2r2_control."  # Names of our modules begin with this. An installation may lack some modules.
 _INTERRUPTED = 130  # Exit code after Ctrl-C.
 
 

@@ -63,7 +63,7 @@ class KeptPair(PairDistance):
 
 @dataclass(frozen=True, slots=True)
 class CellCheck:
-    """The parts of a cell, as the controller uses them, and its faults. Distances are those at home [m].
+    """The parts of a cell, as the controller uses them, and its faults. Distances are for arms at home [m].
 
     A cell without faults has an empty tuple ``faults``.
     """
@@ -81,7 +81,7 @@ class CellCheck:
     remedies: list[str]  # For pairs that are too close at home: lines to paste, and the file to paste them into.
     stop_torques: tuple[StopTorque, ...]  # The torques in a full stop, for each arm.
     driven: dict[str, str]  # The output to each arm's external controller; empty for the built-in controller.
-    controls: dict[str, str]  # By control of a hand, the action that the control causes.
+    controls: dict[str, str]  # The action that each control of a hand causes.
     notes: list[str]  # Lines that a user should read, but that are not faults.
     verdict: str  # One line that says whether the cell can run.
 
@@ -95,7 +95,7 @@ def check_cell(config: Config) -> CellCheck:
     unknown_blocks = check_plant_settings(config)
     robot = Robot.from_config(config)
     # Here the settings still contain the pairs that may touch, so that their names and numbers are checked too. The
-    # kept distances below are those of position mode, in which these pairs must not touch.
+    # kept distances below are for position mode, in which these pairs must not touch.
     check_settings(robot, config.control)
     settings = config.control.without_contact()
     kept = kept_distances(robot, settings)
@@ -175,9 +175,10 @@ def _plant_faults(config: Config, robot: Robot) -> list[str]:
 
 
 def _notes_on_models(config: Config, in_degrees: Collection[str]) -> list[str]:
-    """Return the notes of the models that a user should read.
+    """Return the notes that a user should read about the models.
 
-    The joints ``in_degrees``, which have their names in the cell, are named by a fault and are not asked for units.
+    ``in_degrees`` are names of joints in the cell. A fault already says that their limits are in degrees. Therefore
+    notes that ask for the unit of these joints are left out.
     """
     if config.robot is not None:
         models = [("robot", "", load_model(config.robot, config.packages, "robot"))]
@@ -220,7 +221,8 @@ def _capsules_note(config: Config, robot: Robot) -> str:
 def cost_of_shapes(pairs: Sequence[int], ticks: Sequence[float]) -> str:
     """Return a text about the cost of the additional shapes in the cell's ``capsules``.
 
-    It names both numbers of monitored pairs. It names both times of a tick only if a tick takes longer with the shapes.
+    The text names both numbers of monitored pairs. If a tick takes longer with the additional shapes, the text also
+    names both times of a tick.
 
     Args:
         pairs: The number of monitored pairs with and without the additional shapes.

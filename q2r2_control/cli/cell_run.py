@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 _SHOWS_PICTURES = "show_picture"  # An input has this method if its device can show the run, as a headset can.
 _PERIOD = 1.0 / 30.0  # Period at which the window is drawn [s].
-# Most pictures per second: on a page, of all cameras together; in a headset, of the one camera that it shows.
+# Largest number of pictures per second: on a page, of all cameras together; in a headset, of the one camera in it.
 _ON_PAGE, _IN_HEADSET = 5.0, 30.0
 
 
@@ -141,7 +141,7 @@ class CellRun:
 
 
 def run_cell(config: Config, options: RunOptions) -> CellRun:
-    """Run a cell, and print lines about the run on stderr. Raises :class:`Q2R2Error` if ``options`` do not allow it."""
+    """Run a cell, and print lines about the run on stderr. Raises :class:`Q2R2Error` if the run is not possible."""
     if config.controller is ControllerKind.EXTERNAL:
         builtin = "this command runs controller: builtin only"
         raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
@@ -160,7 +160,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 
 
 def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManager[CameraStreams | None]:
-    """Open all real cameras if pictures are recorded, shown or given to the input; otherwise return None for them."""
+    """Open all real cameras if pictures are recorded, shown or given to the input; otherwise the context gives None."""
     source = load_class(INPUTS, options.input)
     sees = any(hasattr(source, method) for method in (_SHOWS_PICTURES, PolicySource.observe.__name__))
     used = not options.fast and (options.record is not None or options.page is not None or sees)
@@ -198,7 +198,7 @@ def _run_cell(
     try:
         plant = make_plant(options.plant, robot, config)
     except PlantError as error:
-        if options.plant != "mujoco":  # The message below is that of q2r2 check, which checks only the simulation.
+        if options.plant != "mujoco":  # The error below has the words of q2r2 check, which builds only the simulation.
             raise
         raise PlantError(f"{config.name}: FAULT plant {options.plant}: {error}") from error
     if isinstance(plant, WaitingPlant):

@@ -28,7 +28,7 @@ from q2r2_control.ros.watching.findings import Finding, error
 
 _PACKAGE = "q2r2_control"
 
-# By the name of an extra, what does not work without its packages. The extra ros has its own function, _ros.
+# For each extra: a text on what does not work without its packages. The function _ros examines the extra ros.
 _NEEDS_EXTRA = {
     "sim": "no --plant mujoco, no q2r2 demo, no pictures of simulated cameras",
     "data": "no --record, no q2r2 replay, judge, report and export",
@@ -145,7 +145,7 @@ def _ports(cell: Config) -> Iterator[Finding]:
 
 
 def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """Yield a finding if there is no display. Only MuJoCo's window needs one."""
+    """Yield a finding if there is no display. Only MuJoCo's window needs a display."""
     if not has_display(environment):
         yield Finding(
             False,

@@ -32,9 +32,9 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
-# Time between two judgements of tasks [s]. At this rate, they do not make a cabinet late.
+# Time between two judgements of tasks [s]. Judgements at this rate do not make a cabinet late.
 _JUDGED_EVERY = 0.005
-# The lines that the cabinets print: time between two readings [s], and the largest size of all lines [bytes].
+# Time between two readings of the lines that the cabinets print [s], and largest size of all these lines [bytes].
 _LOOKS, _LONGEST_LINES = 0.05, 1 << 16
 _SAFETY_STOP = 1.0  # Duration of a safety stop [s].
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
@@ -43,7 +43,7 @@ _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: Comman
 class Pendant:
     """Acts as the operator at the pendants of the cabinets, and prints the states of the sessions.
 
-    It starts the overlays. After the given times in a session, it ends the session of the first cabinet.
+    It starts the overlays. It also ends sessions of the first cabinet, each after a time that the user has chosen.
     """
 
     def __init__(
@@ -166,8 +166,8 @@ def fri_cabinet(
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
         client = clients[str(arm)] = address_for(its.address) or "127.0.0.1", its.port
-        # A cabinet of KUKA sends from the same port as its client has. At one address, this is not possible, so the
-        # simulated cabinet gets any free port there.
+        # A cabinet of KUKA uses the same port number as its client. If both have the same address, they cannot share a
+        # port, so the simulated cabinet gets any free port.
         port = 0 if its.address == client[0] else its.port
         origins[str(arm)] = its.address, port if source_port is None else source_port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}

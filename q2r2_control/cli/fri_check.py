@@ -36,7 +36,8 @@ class CabinetReport:
     period_ms: float
     messages: int
     lost: int
-    jitter_ms_p99: float  # Absolute deviation of the time between two messages from the cabinet's period.
+    # 99th percentile of the absolute difference between the time from one message to the next and the cabinet's period.
+    jitter_ms_p99: float
     jitter_ms_max: float
     session: str
     quality: str

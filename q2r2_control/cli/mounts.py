@@ -28,7 +28,7 @@ from q2r2_control.wording import sentence
 Tip = Annotated[tuple[float, float, float], Option(help="Point of each tool that touches, in the tool's frame [m].")]
 _FEWEST = 3  # Least number of points that both tips have to touch.
 _MOST_APART = 5.0  # Largest allowed distance, after the fit, between two tips that touched the same point [mm].
-_BEYOND = 0.1  # If a joint is farther beyond its limits than this, it was probably not written in radians [rad].
+_BEYOND = 0.1  # A written joint position farther beyond its limits than this is probably not in radians [rad].
 _STILL, _LISTENS = 2e-3, 0.5  # Joints at rest move less than this angle [rad] in this time [s].
 
 
@@ -101,7 +101,7 @@ def mounts(
     """Find where the right arm's base is: guide both tips by hand to the same points, one after the other.
 
     KUKA's cabinets send the joints of the arms. With other arms, write down the joints of both arms at each point. The
-    left arm's mount is assumed to be right. Lines for the YAML are printed; no file is written.
+    left arm's mount is assumed to be correct. Lines for the YAML are printed; no file is written.
     """
     cell, console = load_config(config), Console(stderr=True)
     robot = Robot.from_config(cell)

@@ -59,12 +59,12 @@ class _Draft:
     file: Path
     data: dict[str, Any]
     notes: list[str] = field(default_factory=list)  # Notes about guessed values.
-    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model, capsules around its meshes.
+    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # The capsules around the meshes of each model.
     always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
     xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments that every xacro model gets, by name.
 
     def part(self, model: str) -> dict[str, Any]:
-        """Return the data of a model's block in the YAML. Its mount is at the world's origin until it is known."""
+        """Return the data of a model's block in the YAML. The model's mount is the world's origin until it is known."""
         args = {"xacro_args": self.xacro_args} if self.xacro_args and model.endswith(".xacro") else {}
         return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
@@ -98,8 +98,8 @@ def new_cell(
 ) -> None:
     """Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, accelerations.
 
-    Exit 1 where q2r2 check still finds faults in it, which are listed. Answers are kept in new-cell.answers.json until
-    it finds none, so that the next try offers them.
+    Exit code 1 if q2r2 check still finds faults in the cell, which are listed. Answers are kept in
+    new-cell.answers.json until there are no faults, so that the next try offers them.
     """
     file, srdf = Path(f"{name}.yaml"), Path(f"{name}.srdf")
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
@@ -130,7 +130,7 @@ def new_cell(
         cell = Robot.from_config(found)
         _limit_acceleration(draft, cell, found)
         approaches = nearest_approaches(cell, samples, 0, CLEARANCE, progress)
-    # A pair of links with several shapes is left out only if no pair of their shapes is watched.
+    # An overlapping pair of links gets into the SRDF only if none of their shapes form a monitored pair.
     watched = {frozenset(map(link_of, pair)) for pair in pair_names(cell.collision_model)}
     overlapping = ((link_of(a), link_of(b)) for a, b in cell.ignored_pairs)
     always = dict.fromkeys([*draft.always, *(links for links in overlapping if frozenset(links) not in watched)])
@@ -286,7 +286,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance
-    near_by_construction = []  # Pairs within an arm, and of an arm with a part of its robot that stands still.
+    near_by_construction = []  # Pairs of links of one arm, and pairs with a fixed link other than the floor.
     for pair in pair_names(robot.collision_model):
         links = link_of(pair[0]), link_of(pair[1])
         one, other = (robot.roles[link].arms for link in links)
@@ -326,7 +326,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
 
 
 def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
-    """If the models have no acceleration limits, set one with which a full stop stays within the torque limits."""
+    """If the models have no acceleration limits, set limits with which a full stop keeps the torque limits."""
     cap = config.control.acceleration_limit
     if np.isfinite(robot.acceleration_limit).all():
         return

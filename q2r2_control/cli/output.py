@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from q2r2_control.judging.judge import Verdict
     from q2r2_control.recording.recorder import RecordingSummary
 
-# A late loop may be the reason why a task failed. It counts as late if one tick was late by at least _LATE [us], or if
-# more than this share of the ticks, _OFTEN, were late by more than a period.
+# A late loop may be the reason why a task failed. A loop counts as late if one tick was late by at least _LATE [us], or
+# if the share of ticks that were late by more than a period is larger than _OFTEN.
 _LATE, _OFTEN = 2e4, 0.2
 # Time until the first line about the compilation of kernels, and time between two such lines [s].
 _SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
@@ -141,7 +141,7 @@ class _CompilingLines:
         self._due = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print a line if it is due. It has an estimate of the remaining time, as if all kernels took equally long."""
+        """Print a line if it is due. It estimates the remaining time, assuming that all kernels take equally long."""
         now = time.monotonic()
         if self._start is None:
             self._start, self._due = now, now + _SILENT_S
@@ -220,7 +220,7 @@ def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
 
 
 class ProgressLines:
-    """A listener of a run without a table. It prints how much of the run is over, some seconds apart."""
+    """A listener of a run without a table. Every few seconds, it prints how much of the run is over."""
 
     def __init__(self, name: str, duration: float, console: Console) -> None:
         """``name`` is the run's name. ``duration`` is how long the run lasts [s]."""

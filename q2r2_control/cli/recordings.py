@@ -165,7 +165,7 @@ def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable
 
 
 def verdict_table(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> Table:
-    """Return a table with a row for each episode. Figures that no episode has are left out, so that names have room."""
+    """Return a table with a row for each episode. Figures that no episode has are left out, to make room for names."""
     # If a figure exists for several hands or arms, its column shows the worst number.
     shown = [column for column in COLUMNS if column.name in _SHOWN]
     columns = [column for column in shown if any(column.value(one.figures) is not None for one in judged)]

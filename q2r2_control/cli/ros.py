@@ -43,8 +43,8 @@ from q2r2_control.viewer.tables import Cell, figure_table
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ROS_ARGUMENTS = "--ros-args"
-_ONCE = 3.0  # This is long enough to find a running set of nodes, and to get several messages of each node [s].
-_TIME = 4.0  # This is long enough to find a running set of nodes, and a second publisher of a topic [s].
+_ONCE = 3.0  # In this time, a running set of nodes is found, and each node sends several messages [s].
+_TIME = 4.0  # In this time, a running set of nodes and a second publisher of a topic are found [s].
 
 
 def set_tables(view: SetView, domain: str) -> Group:
@@ -98,7 +98,7 @@ def watch(
 ) -> None:
     """Show nodes, topics, rates and ages of a running set, the state of each arm, and why it does not move.
 
-    The command only listens, and not to commands, so that it does not influence the set. If stderr is not a terminal,
+    The command only listens, and ignores commands, so that it does not influence the set. If stderr is not a terminal,
     it prints a line whenever the state of an arm changes. Exit code 1 if no node of a set was heard.
     """
     cell = load_config(config)

@@ -59,7 +59,7 @@ class RunRecording(AbstractContextManager["RunRecording"]):
     def begin(self, pipeline: Pipeline, stack: ExitStack, console: Console) -> tuple[Recorder, About]:
         """Record ``pipeline`` from its first tick on. Return the recorder, and the facts about the recording.
 
-        The episodes are judged as they end, until ``stack`` is closed.
+        Each episode is judged when it ends, until ``stack`` is closed.
         """
         recorder, options = self.recorder, self._options
         cameras = tuple(pipeline.config.simulated_cameras)

@@ -40,7 +40,7 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str |
 
 
 def _last_faults(summary: RunSummary) -> dict[str, Event]:
-    """Return, by arm, the arm's last event if it is a fault.
+    """Return the last event of each arm whose last event is a fault.
 
     A fault is an event in which something other than a button paused the arm or kept the arm from engaging.
     """
@@ -85,7 +85,7 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
 
 
 def _faults(summary: RunSummary) -> Iterator[tuple[str, str]]:
-    """Yield each arm's last pause by a fault, with the number of such pauses, and a refusal after which it holds."""
+    """Yield each arm's last pause by a fault, with the number of such pauses, and a refusal if it is the last event."""
     last = _last_faults(summary)
     for name in summary.arms:
         pauses = [event for event in summary.events if event.arm == name and is_fault(event) and not is_refusal(event)]

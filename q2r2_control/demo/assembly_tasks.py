@@ -132,7 +132,7 @@ def with_controls(config: Config) -> Config:
 
 
 def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[float, float]) -> Config:
-    """Return the cell, in which all parts of ``tasks`` are displaced by ``place`` (x, y) [m]."""
+    """Return the cell with all parts of ``tasks`` displaced by ``place`` (x, y) [m]."""
     parts = {part for task in tasks for part in task.parts}
     objects = {
         name: item.model_copy(
@@ -146,7 +146,7 @@ def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[fl
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
-    """Return the ``results``. If the run broke a promise, all of them are failures."""
+    """Return the ``results``. If the run broke a promise, all returned results are failures."""
     results = tuple(results)
     if not summary.broken:
         return results
@@ -167,7 +167,7 @@ class TaskWatch:
             config: The cell of the run.
 
         Raises:
-            ConfigError: If the cell has not all parts of the tasks.
+            ConfigError: If the cell lacks a part of the tasks.
         """
         tasks = tuple(tasks)
         for task in tasks:
@@ -191,7 +191,7 @@ class TaskWatch:
                 judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """Return the results of all tasks. All tasks fail if an arm touched anything but a part with its fingers."""
+        """Return the results of all tasks. All of them fail if an arm touched anything except parts in its fingers."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():

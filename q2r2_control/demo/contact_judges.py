@@ -9,8 +9,8 @@ from q2r2_control.demo.part_judges import FINGERS, HELD_TIME, Judge, PartState, 
 
 _FORCE = (5.0, 15.0)  # The least and the largest force with which the part has to press on the table [N].
 _MEAN_TIME = 0.05  # The time constant of the mean force [s].
-# Least length of the path with that force [m]. Largest length of the path with another force, as a share of the first
-# length.
+# Least length of the path on which the part presses with such a force [m]. Largest length of the path on which it
+# presses with another force, as a share of the length with such a force.
 _WIPED, _ASTRAY = 0.3, 0.1
 _DEEP, _BESIDE = 0.003, 0.001  # The peg's largest distance from the bottom of the hole, and from the hole's middle [m].
 _STRAIGHT = math.radians(3.0)  # The largest tilt of the peg and of the part with the hole [rad].
@@ -21,7 +21,8 @@ class WipeJudge(Judge):
 
     def __init__(self, part: str) -> None:
         super().__init__(part)
-        self._place: tuple[float, float] | None = None  # Last position, if held and on the table [m].
+        # The part's last position [m]; None if fingers did not hold the part, or if it was not on the table.
+        self._place: tuple[float, float] | None = None
         # The mean force and its largest value so far [N]; the path with the wanted force and with another force [m].
         self._force = self._most = self._wiped = self._astray = 0.0
 
@@ -59,11 +60,11 @@ class PegJudge(Judge):
     """A part stands straight at the bottom of the hole of another part, without a finger on it, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
-        """``parts`` has the height of the peg and then that of the hole's bottom, by name of the part [m]."""
+        """``parts`` has, by name of a part, the height of the peg and then the height of the hole's bottom [m]."""
         super().__init__(*parts)
         self._rest = 0.5 * sum(parts.values())  # Vertical distance of the centres when the peg is at the bottom [m].
-        # The time for which the peg has stood in the hole [s]; its distance from the hole's middle, and above its place
-        # at the bottom [m]; the larger tilt of both parts [rad].
+        # The time for which the peg has stood in the hole [s]; its distance from the hole's middle, and its height
+        # above its lowest position [m]; the larger tilt of both parts [rad].
         self._stood = self._beside = self._above = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:

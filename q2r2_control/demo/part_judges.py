@@ -37,9 +37,9 @@ _ROBOT = Toucher.ARM | FINGERS
 class PartState:
     """One loose part at one time."""
 
-    place: tuple[float, float, float]  # The position of its centre in the world [m].
-    tilt: float  # The angle between its z axis and that of the world [rad].
-    touched: int  # The bodies that touch it, as flags of :class:`Toucher`.
+    place: tuple[float, float, float]  # The position of the part's centre in the world [m].
+    tilt: float  # The angle between the part's z axis and the world's z axis [rad].
+    touched: int  # The bodies that touch the part, as flags of :class:`Toucher`.
     pressed: float = 0.0  # The force on the surroundings, if it is measured [N].
 
 
@@ -98,7 +98,7 @@ class TouchWatch:
         }
 
     def _kind(self, body: int, robot: Robot) -> int:
-        """Return the flag of a body that is not a part. The nearest joint between body and world decides."""
+        """Return the flag of a body that is not a part. It depends on the robot's joint by which the body is moved."""
         above = body
         while above:
             for arm, finger in _FINGERS_OF.items():
@@ -118,7 +118,8 @@ class TouchWatch:
 HELD_TIME = 1.0  # The time for which a part has to be held, or to rest [s].
 _LIFT = 0.095  # The least height to which a part is lifted [m].
 _CARRY = 0.1  # The least distance over which a part is carried [m].
-_FALL = 0.005  # A part that no finger touches has fallen if it sinks by more than this [m]. A part put down sinks less.
+# A part that no finger touches has fallen if it sinks by more than this [m]. After fingers put it down, it sinks less.
+_FALL = 0.005
 _PUT_BACK = (0.01, 0.001)  # The largest distance from the position at the start, sideways and in height [m].
 _STACKED = (0.01, 0.001)  # The largest distance from the position on the part below, sideways and in height [m].
 _UPRIGHT = math.radians(2.0)  # The largest tilt of a stacked part [rad].
@@ -201,7 +202,7 @@ class LiftJudge(Judge):
 
 
 class CarryJudge(LiftJudge):
-    """As :class:`LiftJudge`, but both hands hold the part, 100 mm away, and it never tilts by 5 degrees or more."""
+    """The task of :class:`LiftJudge`, but with both hands, 100 mm away, and with a tilt that stays below 5 degrees."""
 
     _wanted = f"held by both hands, {1e3 * _LIFT:.0f} mm up and {1e3 * _CARRY:.0f} mm away,"
 

@@ -37,7 +37,7 @@ class TrialReport:
 
     task: str
     trials: int
-    failures: dict[int, str]  # By seed, the reason of the failure.
+    failures: dict[int, str]  # For each seed with a failure: the reason.
 
     @property
     def succeeded(self) -> int:
@@ -57,7 +57,7 @@ def try_tasks(
     progress: Callable[[str], None] = lambda line: None,
     reads: Path | None = None,
 ) -> list[TrialReport]:
-    """Try each task alone with the seeds 0 .. ``seeds`` - 1. The reports are the same at any ``place``.
+    """Try each task alone with the seeds 0 .. ``seeds`` - 1. The reports do not depend on the ``place`` of the trials.
 
     ``reads`` is the file that trials read; None if they read no file.
     """

@@ -65,15 +65,15 @@ class EpisodeVectors:
     cell: str
     task: str
     fps: int
-    names: Names  # By feature, the names of its numbers.
+    names: Names  # The names of the numbers of each feature.
     notes: dict[str, str]  # The recorded notes, such as program, machine and operator.
     vectors: Vectors
     success: bool | None = None  # Whether the episode succeeded; None if that is not known.
     # Number of frames by which position actions are shifted. Row k contains the position action of frame k + ahead.
     ahead: int = 0
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
-    cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
-    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same for cameras with recorded depth.
+    cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # For each camera, one picture per frame.
+    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # Depth, if it is recorded.
     subtasks: tuple[str, ...] = ()  # The names of the episode's subtasks, in their order; empty if it has none.
     subtask: tuple[int, ...] = ()  # For each frame, the index of its subtask in ``subtasks``; empty without subtasks.
 
@@ -117,7 +117,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         vectors, labels = features(frames, robot)
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
-    # Actions that are motions already lead to the next frame, so they are not shifted.
+    # Actions that are motions already describe the motion to the next frame, so they are not shifted.
     for action in (ActionSpace.JOINTS, ActionSpace.TOOL):
         vectors[action] = _earlier(vectors[action], sampling.ahead)
     notes = dict(recording.about.notes)
@@ -129,7 +129,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         shown = names if sampling.pictures else ()
         return {name: CameraFrames(recording, name, cell.cameras[name], stamps, is_depth) for name in shown}
 
-    # These times are since the run began, as are the times in ``subtask_starts``.
+    # These times are measured from the start of the run, as the times in ``subtask_starts`` are.
     passed = (frames["stamp"] - recording.about.epoch) / NANOSECONDS
     subtasks = subtask_names(cell.recording.subtasks, len(span.subtask_starts))
     number = np.searchsorted(np.array(span.subtask_starts), passed, side="right")
@@ -170,8 +170,8 @@ def spans_to_export(file: Path) -> list[EpisodeSpan]:
 # A function that writes an episode as a new file or folder. It is a module's function, so that other processes can
 # import it.
 Write = Callable[[EpisodeVectors, Path], None]
-# A function that returns the discarded episodes of a file: by the episode's number, the reason. The second argument
-# says whether the pictures are judged too. It is a module's function as well.
+# A function that returns the number of each discarded episode of a file, and the reason. The second argument
+# says whether the pictures are judged too. It is a module's function, too.
 Verdicts = Callable[[Path, bool], Mapping[int, str]]
 _LONGEST_REASON = 300  # The longest text of a reason [characters].
 

@@ -35,7 +35,7 @@ _AXES = ("frame", "row", "column")
 _COMPRESSION = 1  # The fastest level of gzip.
 ROBOMIMIC = "robomimic.h5"  # The name does not end with .hdf5, because some trainers of ACT read all such files.
 UNITS = "units.json"  # The file beside the CSV files, with the unit of each column of numbers.
-# By the names that robomimic reads in a demonstration, the names of the data to which they link.
+# For each name that robomimic reads in a demonstration: the name of the data to which it links.
 _LINKS = {
     **{"actions": "action", "rewards": "rewards", "dones": "dones"},
     **{"obs/qpos": "observations/qpos", "obs/qvel": "observations/qvel"},
@@ -154,7 +154,8 @@ def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
                 demo[name] = h5py.ExternalLink(moved.name, target)
             demo.attrs["num_samples"] = frames
             total += frames
-        # robomimic needs the description of an environment, even for training without one. Type 2 stands for Gym.
+        # robomimic needs the description of an environment, even if the training uses no environment. Type 2 stands for
+        # Gym.
         demos.attrs["env_args"] = json.dumps({"env_name": cell, "type": 2, "env_kwargs": {}})
         demos.attrs["total"] = total
 

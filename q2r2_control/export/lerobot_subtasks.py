@@ -1,8 +1,8 @@
 """Adds the subtasks of episodes to a LeRobotDataset, in two forms: for older and for newer versions of lerobot.
 
-lerobot up to 0.5 reads the column ``subtask_index``. It has the index of each frame's subtask in
-``meta/subtasks.parquet``. lerobot from 0.6 on reads the column ``language_persistent``. At each frame, it has all
-subtasks of the episode and the times at which they begin.
+lerobot up to 0.5 reads the column ``subtask_index``. For each frame, this column has the index of the subtask in the
+table ``meta/subtasks.parquet``. lerobot from 0.6 on reads the column ``language_persistent``. At each frame, this
+column has all subtasks of the episode and the times at which they begin.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from q2r2_control.export.episodes import SUBTASK, EpisodeVectors
 
-SHARD_FILE = "meta/subtasks_of_episode.json"  # The subtasks of one episode until the episodes are joined.
+SHARD_FILE = "meta/subtasks_of_episode.json"  # A file with one episode's subtasks until episodes are joined.
 TABLE = "meta/subtasks.parquet"
 _INFO = "meta/info.json"
 _LANGUAGE = ("language_persistent", "language_events")

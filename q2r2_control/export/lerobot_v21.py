@@ -44,7 +44,7 @@ def require_v21() -> None:
 
 
 def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:
-    """Return, by the name of each camera, its name in the dataset.
+    """Return the name of each camera in the dataset.
 
     One camera on each arm and one other camera get the names of openpi. All further cameras keep their names. A camera
     is on an arm if the name of its link begins with the arm's name. A camera on a ROS topic has no link. It is on an

@@ -52,8 +52,8 @@ _OLDEST = 2
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
     """Return the observations and commands at each of n frames of the ``span``, by name.
 
-    The time t_0 is that of the first tick in the ``span``. With ``trim``, it is that of the first tick at which an arm
-    is engaged or the reference moves, and frames end with the last such tick. The result contains:
+    The time t_0 is the time of the first tick in the ``span``. If ``trim`` is True, it is the time of the first tick at
+    which an arm is engaged or the reference moves, and the frames end with the last such tick. The result contains:
 
     - ``position``, ``velocity``, ``effort`` (n, joints): measured numbers [rad, rad/s, Nm].
     - ``opening`` (n, arms): measured openings of grippers, 0 closed .. 1 open; -inf if not measured.
@@ -160,7 +160,7 @@ def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[n
 def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:
     """Return two dicts by feature: the vectors (n, size) of the n ``frames``, and the names of the vectors' numbers.
 
-    The ``frames`` are those of :func:`sample`. Grippers that the plant does not measure, or that are not commanded, are
+    The ``frames`` come from :func:`sample`. Grippers that the plant does not measure, or that are not commanded, are
     left out. Raises :class:`RecordingError`, without the file's name, if a number is not finite or if ``robot`` is not
     the recorded robot.
     """
@@ -201,7 +201,7 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
 
 
 def units_of(names: Names) -> Names:
-    """Return, by feature, the unit of each number. ``names`` are those that :func:`features` returns."""
+    """Return, by feature, the unit of each number. ``names`` come from :func:`features`."""
     return {feature: tuple(_unit(feature, label) for label in labels) for feature, labels in names.items()}
 
 
@@ -233,7 +233,8 @@ def continuous(poses: Array, first: Array | None = None) -> Array:
     """Return the ``poses`` (n, arms, 7) with quaternions whose signs do not change from frame to frame.
 
     A quaternion and its negative are the same rotation. At the first frame, the sign is chosen so that the quaternion
-    is nearer to that in ``first`` (arms, 7). Without ``first``, its number with the largest absolute value is positive.
+    is nearer to the quaternion in ``first`` (arms, 7). Without ``first``, the sign is chosen so that the quaternion's
+    number with the largest absolute value is positive.
     """
     quaternions = poses[..., 3:]
     if first is None:
@@ -262,7 +263,7 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of one camera, one for each frame of an episode.
+    """The pictures of one camera, with one picture for each frame of an episode.
 
     They show colours or depth. In depth, the number 0 stands for an unknown depth.
     """

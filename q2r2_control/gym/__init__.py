@@ -23,7 +23,7 @@ __all__ = ["TASKS", "make_env", *_MODULES]
 __getattr__, __dir__ = lazy_exports(__name__, _MODULES)
 
 TASKS = ("carry", "clash", "grasp", "handover", "meet", "peg", "stack", "wipe")
-_MOST_STEPS = 900  # Half a minute at 30 Hz.
+_MOST_STEPS = 900  # An episode ends after this number of steps: half a minute at 30 Hz.
 
 for _task in TASKS:
     gymnasium.register(
@@ -45,7 +45,7 @@ def make_env(
 ) -> AsyncVectorEnv | SyncVectorEnv:
     """Make ``n_envs`` environments of a task, each in a process of its own if ``use_async_envs`` is True.
 
-    ``space`` and ``options`` are those of :class:`q2r2_control.gym.task_env.TaskEnv`. By default an action has the
+    ``space`` and ``options`` go to :class:`q2r2_control.gym.task_env.TaskEnv`. By default an action has the
     numbers of a dataset's ``action``, which policies of lerobot return. ``cfg`` is the configuration that lerobot's
     EnvHub passes; it is not used.
     """

@@ -53,8 +53,8 @@ class TaskEnv(gymnasium.Env):
     ``spread`` [m] is the largest random offset of the task's parts, along x and along y; the seed decides it. With
     ``pictures``, observations contain pictures of the cell's simulated cameras. If the cell has none, a camera in front
     of the cell takes them. ``loop_rate`` [Hz] is the rate of the control loop; None stands for the cell's rate. At 100
-    Hz, a step of the environment needs a quarter to a third of the computing time that it needs at 1 kHz. The step of
-    the physics is that of the cell at every rate.
+    Hz, a step of the environment needs a quarter to a third of the computing time that it needs at 1 kHz. The physics
+    has the cell's own step at every rate.
 
     No action breaks a limit or a distance. ``info["promises"]`` describes a step. ``nearest_distance`` [m] is the
     smallest distance of any pair, and ``nearest_pair`` is this pair. ``margin`` [m] is the smallest distance of a pair

@@ -26,9 +26,9 @@ _ODD, _ODD_RATIO = 10.0, 3.0
 # parts, pixel rows of each part, columns of parts, pixel columns of each part.
 _PARTS = (4, 6, 4, 8)
 # Damaged parts are searched for only if the camera's rate is at least this [Hz]. At a lower rate, a moving body may be
-# in a part in one picture only. The part would then wrongly count as damaged.
+# visible in a part of only one picture. This part would then wrongly count as damaged.
 _QUICK = 10.0
-LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
+LARGEST_LAG = 0.4  # The largest lag, of either sign, that is compared [s].
 _LAG_STEP = 0.02  # The step between two lags that are compared [s].
 _IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].
 # A larger lag is chosen only if two conditions hold. The first condition: the share of the pictures' motion that the
@@ -39,7 +39,7 @@ _CLEARLY = 0.05
 _UNEXPLAINED = 0.65
 _LEAST_FIT = 0.35  # Least share of the pictures' motion that the arms' motion must explain, or else the lag is unknown.
 _FEWEST = 20  # With fewer pictures, no lag is computed and no swap of cameras is found.
-# A camera on an arm is compared with fixed cameras if the joints of its arm travel more than this in all [rad].
+# A camera on an arm is compared with fixed cameras if the joints of its arm travel more than this in the episode [rad].
 _LEAST_TRAVEL = 0.5
 # Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's arm.
 _CORRELATES = 0.4  # Each camera's correlation with the other camera's arm must be larger than this.
@@ -64,8 +64,8 @@ class CameraFigures:
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    # The share of frozen pictures among the pictures just before which an arm moved. A picture is frozen if it equals
-    # the picture before it.
+    # The share of frozen pictures, which equal the picture before. A picture counts only if an arm has moved since the
+    # picture before.
     frozen_share: float | None
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
@@ -164,8 +164,8 @@ class _CameraLook:
         """Return the lag [s] at which the arms' speeds s explain the change of the pictures best.
 
         The model is c_1 s_1 + c_2 s_2 + c_0, with all c >= 0. A lag that is not near zero counts only if it explains
-        the change clearly better than the lags near zero, since two motions make a wrong lag fit too: An arm that moves
-        to and fro has the same speed again later. An arm that moves in a circle looks faster when it is near the
+        the change clearly better than the lags near zero, since two motions make a wrong lag fit, too. An arm that
+        moves to and fro has the same speed again later. An arm that moves in a circle looks faster when it is near the
         camera.
 
         Return None if there are too few pictures, if they do not change, or if the best lag explains too little.
@@ -212,7 +212,7 @@ class _CameraLook:
 
 
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
-    """Return the cameras that were swapped: by the name of each camera, the name of the other camera.
+    """Return the name of each camera that was swapped, with the name of the other camera.
 
     Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's
     arm. A fixed camera and a camera on an arm are swapped if two conditions hold: Hardly anything stands still in the

@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_too
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags
 
-FRAME = 0.01  # A frame is a tick whose poses are kept. This is the time from one frame to the next [s].
+FRAME = 0.01  # The time from one frame to the next [s]. A frame is a tick whose poses are kept.
 SPEED_OVER = 0.02  # A measured speed is an average over at least this time, since ticks are not evenly spaced [s].
 
 
@@ -46,7 +46,7 @@ class Ticks:
     gripper: Array  # (n, arms) The gripper's opening that the operator wants, 0 closed .. 1 open.
     now: Array  # (n,) Time of the tick by the loop's own clock [s].
     unmeasured: Flags  # (n, arms) True if a measured number, or a number of the reference, is not finite.
-    joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed and the speed limit of that joint.
+    joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed to the speed limit of that joint.
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording, or one episode of a recording. Times are since its beginning [s]."""
+    """One recording, or one episode of a recording. Times are measured from its beginning [s]."""
 
     recording: Recording
     config: Config
@@ -86,7 +86,7 @@ class Episode:
     hands: dict[str, Hand]  # The hands that an arm follows, by name.
     events: list[Event]
     damage: str | None  # The reason why the file cannot be read to its end; None if it can.
-    # By the name of a camera, its pictures. Cameras whose pictures were not read, or cannot be read, are missing.
+    # The pictures of each camera. Cameras whose pictures were not read, or cannot be read, are missing.
     pictures: dict[str, Pictures] = field(default_factory=dict)
     ended_by: str | None = None  # The fault that ended the run; None if no fault did.
     # True if the episode succeeded, as the task's own check or the operator says; None if that is not known.
@@ -125,7 +125,7 @@ class Episode:
 def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
     """Read a recording, with or without its ``pictures``. A damaged file is read up to the damage.
 
-    Raises :class:`RecordingError` if its cell cannot be built, or if the robot is not the recorded one.
+    Raises :class:`RecordingError` if its cell cannot be built, or if its robot is not the recorded robot.
     """
     config, robot = cell_and_robot_of(recording)
     read = _Read(recording, robot)

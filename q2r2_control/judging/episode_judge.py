@@ -24,7 +24,7 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.wording import sentence
 
 LONGEST_LINE = 300  # The longest text of a verdict [characters].
-_NICENESS = 10  # The niceness of the process that judges. The writer has the same; the loop has a higher priority.
+_NICENESS = 10  # The niceness of this process, and of the process that writes. The loop has a higher priority.
 _LOOKS = 0.3  # Time between two attempts to read the episode from the file, which grows twice a second [s].
 _PATIENCE = 30.0  # Longest time to wait until the recorder has written the episode [s].
 _BEFORE = 1_000_000_000  # Reading begins this long before the episode [ns].

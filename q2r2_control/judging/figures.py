@@ -21,8 +21,8 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
-# If an arm has a target in more frames than this, which is one second, a message on its target topic is expected. In so
-# much time, even a topic with a low rate gets a message.
+# If an arm has a target in more frames than this, which are one second, its target topic must have a message. In one
+# second, even a topic with a low rate gets a message.
 _SURELY = 100
 _SHORTEST = 1e-3  # The shortest time for which an arm counts as engaged [s].
 
@@ -121,7 +121,7 @@ class TimingFigures:
     # of their messages may arrive together.
     repeated_stamps: int | None
     clock_step_s: float  # The largest step by which a clock was set: negative if it was set back, 0 if none was set.
-    begins_again: bool  # True if the run goes on after its end has begun, so that two runs are in one file.
+    begins_again: bool  # True if arms follow again after a run has begun to end. The file then contains two runs.
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ class EpisodeFigures:
     idle_share: float | None
     hands: dict[str, HandFigures]
     arms: dict[str, ArmFigures]
-    measured: dict[str, MeasuredFigures]  # By arm.
+    measured: dict[str, MeasuredFigures]  # The figures of the measurements, by arm.
     cameras: dict[str, CameraFigures]
     empty_topics: list[str]  # The topics that should have a message and have none.
     faults: list[Fault]
@@ -227,7 +227,7 @@ def _empty_topics(episode: Episode) -> list[str]:
     """Return the topics that should have a message and have none.
 
     The list is empty for a file without an index, because the numbers of its messages are not known. It is also empty
-    for a recording of ROS nodes, because they may have published nothing.
+    for a recording of ROS nodes, because the nodes may have published nothing.
     """
     about, counts = episode.recording.about, episode.recording.counts
     if about.source != LOOP or counts is None or not len(episode.ticks.t):

@@ -122,7 +122,7 @@ def parts_of(episode: Episode) -> list[Episode]:
 
 
 def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
-    """Return an episode of a recording. Times are since the episode began, and its first tick has number 0."""
+    """Return an episode of a recording. Times are measured from its beginning, and its first tick has number 0."""
     ticks, frames = episode.ticks, episode.frames
     # ``searchsorted`` cannot be used: if the clock was set back, the times are not in ascending order.
     inside = np.flatnonzero((span.start <= ticks.t) & (ticks.t <= span.end))
@@ -198,7 +198,7 @@ class Unreadable:
 
 
 def judge(recording: Recording, settings: JudgeSettings | None = None, *, pictures: bool = True) -> list[Judged]:
-    """Judge a recording's episodes by ``settings``, or by the thresholds of its cell if None.
+    """Judge a recording's episodes by ``settings``; if it is None, by the thresholds of the recorded cell.
 
     Raises the same errors as :func:`read_episode`.
     """
@@ -239,7 +239,7 @@ def judgements_of(settings: JudgeSettings | None, file: Path) -> list[Judgement 
 
 
 def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
-    """Return the discarded episodes of a recording: by the number of the episode, the verdict in one line.
+    """Return the number of each discarded episode of a recording, with the verdict in one line.
 
     The number 0 stands for the whole recording. The pictures are judged if ``pictures`` is True.
 

@@ -15,15 +15,15 @@ from q2r2_control.judging.episode import FRAME, Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Flags
 
-# Smoothness is computed for short, overlapping time spans of a motion, which are called pieces. This is their
-# duration [s].
+# Duration of a piece [s]. Smoothness is computed for short, overlapping time spans of a motion, which are called
+# pieces.
 PIECE = 1.0
 _HOP = 0.25  # The time from the start of one piece to the start of the next [s].
 _FEWEST = 8  # Without at least this number of pieces, no smoothness is computed.
 _SLOWEST = 0.02  # Pieces with a lower mean speed of the tool do not count [m/s].
 _LONGEST_GAP = 0.05  # If two frames are farther apart than this, no piece may contain both [s].
-# Positions are smoothed by a Gaussian with this standard deviation before the jerk is computed [s]. It halves the power
-# at 6.6 Hz.
+# Positions are smoothed by a Gaussian with this standard deviation before the jerk is computed [s]. The Gaussian halves
+# the power at 6.6 Hz.
 _SMOOTHING = 0.02
 LONGEST = 0.5  # The longest delay that is searched for [s].
 _STEP = 0.005  # The step between two delays, and between the times at which velocities are compared [s].
@@ -79,8 +79,8 @@ def ldlj(position: Array, dt: float) -> float:
 
     LDLJ = -ln(T^3 / v_peak^2 * integral of |d^3 x / dt^3|^2 dt) over the duration T (Balasubramanian,
     Melendez-Calderon, Roby-Brami, Burdet, On the analysis of movement smoothness, JNER 2015). The dimensionless jerk is
-    that of Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. A single reach of minimum
-    jerk has about -5.3.
+    defined by Hogan and Sternad, Sensitivity of smoothness measures to movement duration, 2009. A single reach of
+    minimum jerk has an LDLJ of about -5.3.
     """
     velocity = np.diff(position, axis=0) / dt
     jerk = np.diff(velocity, n=2, axis=0) / dt**2
@@ -109,13 +109,13 @@ class Track(NamedTuple):
 
 
 def delays(episode: Episode, hand: str) -> list[float | None]:
-    """Return two delays [s]: of the target, and of the measured tool, behind the poses of a hand as they were received.
+    """Return the delays of the target and of the measured tool behind the received poses of a hand [s].
 
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
     the arm is engaged. Here v is the velocity of the target or tool, and M (3, 3) maps the hand's axes to the world, as
     the teleoperation does. The anchors, the scale and the time for which the hand rests do not matter. A delay is None
-    in three cases: The hand has an RMS speed below 10 mm/s, for example because it only turns. Its motion explains less
-    than half of the motion of the target or tool. No maximum is within (0, 0.5) s.
+    in three cases: The hand has an RMS speed below 10 mm/s, for example because it only turns. The hand's motion
+    explains less than half of the motion of the target or tool. No maximum is within (0, 0.5) s.
     """
     samples = episode.hands[hand]
     arm = episode.arms.index(samples.arm)
@@ -158,7 +158,7 @@ def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
     """Return the delay [s] with the highest correlation, interpolated between two ``lags`` [s].
 
     Of several delays with nearly the same correlation, the delay nearest to zero is returned. The result is None if no
-    delay explains enough of the motion, or if the best one is the first or the last of ``lags``.
+    delay explains enough of the motion, or if the best delay is the first or the last of ``lags``.
 
     Args:
         lags: The delays to compare (k,) [s].
@@ -199,7 +199,7 @@ class ArmFigures:
 
 
 def arm_figures(episode: Episode, arm: str) -> ArmFigures:
-    """Return the figures of an arm; delays and smoothness are those of :func:`delays` and :func:`smoothness`."""
+    """Return the figures of an arm. Delays come from :func:`delays`, and smoothness comes from :func:`smoothness`."""
     index = episode.arms.index(arm)
     ticks = episode.ticks
     engaged = ticks.engaged[:, index] & ticks.following
@@ -236,7 +236,7 @@ def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
 
 
 def idle_share(episode: Episode) -> float | None:
-    """Return the share of the run, until it begins to end, in which no engaged arm moves.
+    """Return the share of the run in which no engaged arm moves. The end of the run is left out.
 
     An arm moves if its tool pose, at the controller's reference, differs by more than 2 mm or 0.02 rad from its pose
     half a second earlier or later. It also moves if its gripper gets another command in that time. Thus an arm that

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLOURS = {"left": "#1f6fb2", "right": "#d9722b"}
-_LINE_STYLES: dict[str, Any] = {"left": "-", "right": (0, (4, 3))}  # The right line is drawn on top, so it is dashed.
+# The line of the right arm is dashed, because it is drawn over the line of the left arm.
+_LINE_STYLES: dict[str, Any] = {"left": "-", "right": (0, (4, 3))}
 _POINTS = 500  # The largest number of points of a line.
 _SPEED_OVER = 5  # The number of frames over which a speed is averaged.
 _SHADE: dict[str, Any] = {"color": "#b0b0b0", "alpha": 0.35, "linewidth": 0.0}
@@ -178,7 +179,7 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
 def _draw_errors(axes: Axes, judged: Judged) -> None:
     for index, arm in enumerate(judged.episode.arms):
         _draw(axes, arm, judged.episode.frame_t, 1e3 * tracking_errors(judged.episode, index)[0])
-    # The axis must not reach up to the limit: if it is far above all errors, they would look like a flat line.
+    # The axis is not extended to the limit. If the limit is far above all errors, they would look like a flat line.
     highest = max(1.0, axes.get_ylim()[1])
     if (limit := judged.settings.max_position_error_p99) is not None:
         axes.axhline(1e3 * limit, label=f"p99 at most {1e3 * limit:g}", **_LIMIT)
@@ -227,7 +228,7 @@ def _draw_timing(axes: Axes, judged: Judged) -> None:
     """Draw the time between ticks, and a red background where ticks are missing in the file."""
     ticks = judged.episode.ticks
     axes.plot(*thinned(ticks.t, 1e3 * ticks.dt, np.fmax), color="#555555", linewidth=1.0, label="between ticks")
-    if judged.episode.recording.about.realtime:  # In simulated time the computing time does not matter.
+    if judged.episode.recording.about.realtime:  # Computing times do not matter in simulated time.
         compute = thinned(ticks.t, 1e3 * ticks.compute_time, np.fmax)
         axes.plot(*compute, color=_COLOURS["left"], linewidth=0.8, alpha=0.7, label="computing")
     for number, at in enumerate(np.flatnonzero(np.diff(ticks.number) > 1)[:_POINTS]):

@@ -32,7 +32,7 @@ class Pictures:
     t: Array  # (k,) The time of the tick that a picture shows, since the recording began [s].
     views: npt.NDArray[np.uint8]  # (k, *VIEW) The averaged brightness; zeros if a picture could not be decoded.
     repeated: Flags  # (k,) True if every pixel is the same as in the picture before.
-    damaged: Flags  # (k,) True if the picture could not be decoded, or only in part.
+    damaged: Flags  # (k,) True if the picture could not be decoded completely.
     other_size: Flags  # (k,) True if the picture has another size than the cell says for the camera.
 
     def between(self, start: float, end: float, origin: float) -> Pictures:
@@ -43,7 +43,7 @@ class Pictures:
 
 
 class _Look(NamedTuple):
-    """What is kept of one picture; see the fields of :class:`Pictures` with the same names."""
+    """The data that is kept of one picture; see the fields of :class:`Pictures` with the same names."""
 
     t: float
     view: npt.NDArray[np.uint8]

@@ -17,7 +17,7 @@ class Rejection:
 
 class _Unit(NamedTuple):
     name: str = ""
-    scale: float = 1.0  # The factor from the SI unit of the threshold to this unit.
+    scale: float = 1.0  # The factor from the SI unit of the threshold to the unit ``name``.
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +29,8 @@ class Threshold:
     figure: str
     words: str
     unit: _Unit
-    figure_in_unit: bool = False  # The number is in ``unit`` and not in the SI unit of the threshold.
-    size_only: bool = False  # The sign of the number does not matter.
+    figure_in_unit: bool = False  # True if the number is in ``unit`` and not in the threshold's SI unit.
+    size_only: bool = False  # True if the sign of the number does not matter.
 
     def reason(self, value: float | None, limit: float | None, whose: str) -> Rejection | None:
         """Return why a value is beyond the limit, or None if it is not beyond it.

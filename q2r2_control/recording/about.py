@@ -97,7 +97,7 @@ class About:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Facts that a run states at its end. The recording of a run that was killed has none."""
+    """Facts that a run states at its end. If a run was killed, its recording has no conclusion."""
 
     success: bool | None = None  # The result of the task's own check; None if there was no check.
     ended_by: str | None = None  # The fault that ended the run; None if no fault did.
@@ -131,8 +131,8 @@ def changes(about: About, config: Config, robot: Robot) -> list[str]:
 
     Args:
         about: The facts that the recorded run stated.
-        config: The cell now.
-        robot: The robot now.
+        config: The present cell.
+        robot: The present robot.
     """
     now = program()
     found = [

@@ -1,6 +1,6 @@
 """Write a bag of rosbag2: an MCAP file, which the package ``mcap`` writes, and a ``metadata.yaml`` of version 9.
 
-ROS is not needed. The rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. The package ``rosbags``
+ROS is not needed. The YAML follows metadata_io.cpp in https://github.com/ros2/rosbag2. The package ``rosbags``
 provides the message types. Its writer (0.11) is not used: it writes neither the sequence numbers of messages nor
 attachments, and it may end a chunk between the messages of one tick.
 """
@@ -69,7 +69,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def _begin(self) -> dict[int, int]:
         """Write all records that come before the first message.
 
-        Return, by the channel of a topic in this program, the id that the channel has in the file.
+        Return a mapping from the channel that a topic has in this program to the channel's id in the file.
         """
         about = self._about
         self._writer.start("ros2", "q2r2_control")
@@ -140,7 +140,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
-        """Declare the topics. Return, by a topic's channel in this program, the id of that channel in the file."""
+        """Declare the topics. Return a mapping from each channel in this program to the channel's id in the file."""
         qos = {"offered_qos_profiles": yaml_of([_QOS]).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):

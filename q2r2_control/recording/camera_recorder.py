@@ -25,10 +25,10 @@ from q2r2_control.summary.tick import Tick
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco import MujocoPlant
 
-# Total size of the copied positions that may wait for the process [bytes]. For the shipped cell, they belong to some
+# Total size of the copied positions that may wait for the process [bytes]. In the shipped cell, this is enough for some
 # seconds of a camera at 30 Hz.
 ROOM = 128 << 10
-_NICENESS = 19  # The loop and the writer have a higher priority.
+_NICENESS = 19  # The niceness of this process. The loop and the writer have a higher priority.
 _QUALITY = 90  # The JPEG quality of the pictures.
 # A picture is already taken if the time until it is due is less than this share of its camera's period. Times are
 # rounded, so a picture that is due now may seem to be due a little later.
@@ -42,7 +42,7 @@ class CameraSetup:
 
     model: bytes  # The pickled mujoco.MjModel that the pictures show.
     cameras: dict[str, CameraConfig]
-    channels: dict[str, int]  # By camera, the channel in the file of the recording.
+    channels: dict[str, int]  # The channel of each camera in the file of the recording.
     waited_for: bool  # True if the loop waits for the pictures, as it does in simulated time.
 
 
@@ -50,7 +50,7 @@ class PictureRequest(NamedTuple):
     """A request for one picture of each of some cameras, at one tick."""
 
     number: int  # The number of the tick.
-    time: int  # The Unix time [ns].
+    time: int  # The Unix time of the tick [ns].
     cameras: list[str]
     qpos: bytes  # The model's qpos as float64: the positions of all joints and loose bodies.
 
@@ -93,9 +93,9 @@ class CameraRecorder:
             **ENVIRONMENT,
         )
         self.due = 0  # The number of pictures that were due up to now.
-        self._plant: MujocoPlant | None = None  # None before :meth:`prepare`.
+        self._plant: MujocoPlant | None = None  # The simulation; None before :meth:`prepare`.
         self._rates: dict[str, float] = {}  # The rates of the cameras [Hz].
-        self._last: dict[str, int] = {}  # By camera, the number of its last picture.
+        self._last: dict[str, int] = {}  # The number of each camera's last picture.
         self._next = -math.inf  # The time since the start of the run at which the next picture is due [s].
 
     def _on_answer(self, picture: Message | None) -> None:

@@ -21,8 +21,9 @@ _SHARE = 0.5
 def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:
     """Return, for each of n ticks, by how much the clock was set just before the tick (n,) [s].
 
-    The number is negative if the clock was set back, and 0 if it was not set. It is also positive if the controller
-    stood still and counted less time than passed. The data does not show which of the two has happened.
+    The number is positive if the clock was set forward, negative if it was set back, and 0 if it was not set. The
+    number is also positive if the controller stood still and counted less time than passed. The data does not show
+    whether the clock was set or the controller stood still.
 
     Args:
         numbers: Numbers of the ticks (n,).

@@ -16,11 +16,11 @@ class DeviceMessages:
     """Takes the pictures of a recording's open cameras. Times are by the monotonic clock."""
 
     streams: CameraStreams
-    channels: Mapping[str, int]  # By topic, the channel of its messages.
+    channels: Mapping[str, int]  # The channel of each topic's messages.
     day: Callable[[float], int]  # Converts a time [s] to the Unix time [ns].
     begin: float  # Time at which the recording begins [s].
     _watches: dict[str, CameraWatch] = field(init=False)
-    _numbers: dict[str, int] = field(init=False)  # By camera, the number of pictures so far.
+    _numbers: dict[str, int] = field(init=False)  # The number of each camera's pictures so far.
 
     def __post_init__(self) -> None:
         streams = self.streams.streams
@@ -31,7 +31,8 @@ class DeviceMessages:
         """Return the messages of all pictures since the last call, and the events of cameras, such as a stop.
 
         In a message, ``sent`` is the Unix time at which its picture was captured. ``time`` is the Unix time at which
-        the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of ``time``.
+        the picture was received. For a picture of depth, ``time`` is the Unix time of this call, which is made at
+        ``now`` [s]. The file's messages are in the order of ``time``.
         """
         messages, reasons = [], []
         for name, stream in self.streams.streams.items():

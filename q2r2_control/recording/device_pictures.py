@@ -51,7 +51,7 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
         self._channels = {name: topic.channel for name, topic in topics.items()}
         self._times = LoopTimes()
         self._watches: dict[str, CameraWatch] = {}
-        self._before: dict[str, CameraShot] = {}  # By camera, the newest picture before the first tick.
+        self._before: dict[str, CameraShot] = {}  # Each camera's newest picture before the first tick.
         self._depth_before: dict[str, DepthShot] = {}
         self._count = 0
         self._begin = 0.0  # Time of the first tick, by the monotonic clock [s].

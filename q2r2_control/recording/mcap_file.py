@@ -1,6 +1,6 @@
 """Reads MCAP files of any writer, also files whose end is missing.
 
-The package ``mcap`` decodes the records. In a file whose end is missing, it cannot find them. Therefore this module
+The package ``mcap`` decodes the records, but cannot find them in a file whose end is missing. Therefore this module
 goes through the file from record to record. The rules of the format are in https://mcap.dev/spec.
 """
 
@@ -49,8 +49,8 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._types: dict[int, str] = {}  # By the id of a schema, the message type.
-        self._topics: dict[int, Topic] = {}  # By the id of a channel.
+        self._types: dict[int, str] = {}  # Message types. The keys are the ids of schemas.
+        self._topics: dict[int, Topic] = {}  # Topics. The keys are the ids of channels.
         self._skipped: list[_Place] = []  # Chunks that were not read and may declare channels.
 
     def topics(self) -> dict[int, Topic]:
@@ -120,7 +120,7 @@ class McapFile:
 
         Channels that the records declare are stored.
         """
-        channels: dict[int, bool] = {}  # By channel, True if its topic is among ``topics``.
+        channels: dict[int, bool] = {}  # True for each channel whose topic is among ``topics``.
         for one in records:
             if isinstance(one, McapMessage):
                 channel = one.channel_id

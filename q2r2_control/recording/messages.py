@@ -1,8 +1,8 @@
 """Topics of recordings and their messages: ROS 2 messages in CDR, made by rosbags.
 
 A recording contains the run of one loop, or messages of the ROS nodes. The data of a loop's run is on the topics
-``tick``, ``hand_samples`` and ``state``, and on those of the pictures. The replay, the judge and the export read these
-topics. The other topics repeat this data as standard messages, which plotting tools and viewers can show.
+``tick``, ``hand_samples`` and ``state``, and on the topics of the pictures. The replay, the judge and the export read
+these topics. The other topics repeat this data as standard messages, which plotting tools and viewers can show.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def heard_on(topic: str) -> str:
 
 
 def is_compressed(topic: str) -> bool:
-    """Return whether a camera's topic has CompressedImage messages. image_transport gives such topics this ending."""
+    """Return whether a camera's topic has CompressedImage messages, by the ending that image_transport gives it."""
     return topic.endswith("/compressed")
 
 
@@ -192,7 +192,7 @@ def is_latched(topic: str) -> bool:
 def is_reliable(topic: Topic) -> bool:
     """Return whether the recorder requests reliable delivery from ROS, so that all messages of a topic arrive.
 
-    For topics with commands and streams it does not, because their senders must not wait for the recorder.
+    For topics with commands and streams, the recorder does not request it, because their senders must not wait.
     """
     return topic.type in (ARRAY, TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 
@@ -200,8 +200,8 @@ def is_reliable(topic: Topic) -> bool:
 class Message(NamedTuple):
     channel: int
     number: int  # The number of the message's tick, or the sequence number that the sender gave the message.
-    time: int  # The Unix time at which it was received, or of the tick to which it belongs [ns].
-    sent: int  # The Unix time at which it was sent, by the sender's clock [ns].
+    time: int  # The Unix time of the message's receipt, or of the tick to which it belongs [ns].
+    sent: int  # The Unix time at which the message was sent, by the sender's clock [ns].
     payload: bytes  # The message in CDR.
 
     @property
@@ -329,7 +329,7 @@ def data_of(payload: bytes, kind: str) -> Any:
 
 
 def numbers_of(payloads: list[bytes], count: int) -> Array:
-    """Return the numbers (n, count) of n messages with arrays. Raises :class:`ValueError` for another length."""
+    """Return the numbers (n, count) of n messages with arrays. Raises :class:`ValueError` for other lengths."""
     arrays = [data_of(payload, ARRAY) for payload in payloads]
     if any(len(array) != count for array in arrays):
         raise ValueError(f"an array that has not {count} numbers")

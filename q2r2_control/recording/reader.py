@@ -50,7 +50,7 @@ BROKEN = (
 class Picture:
     # The Unix time at which the picture was captured, or was received if a ROS node sent it [ns].
     time: int
-    tick: int  # The number of the newest tick at that time. In a recording of ROS nodes, it is a sequence number.
+    tick: int  # The number of the newest tick at ``time``. In a recording of ROS nodes, it is a sequence number.
     jpeg: bytes  # The picture as a JPEG file; a picture of depth is a PNG file with 16 bits for each pixel.
 
 
@@ -115,7 +115,7 @@ class Recording:
         raise RecordingError(f"{self.file}: depth of camera {camera}: no picture was recorded")
 
     def _coded(self, names: Mapping[str, str]) -> Iterator[tuple[str, Picture]]:
-        """Yield all pictures on the topics in ``names``. Each comes with the name that ``names`` has for its topic."""
+        """Yield all pictures on the topics in ``names``. ``names`` maps a topic to the name that is yielded."""
         for messages in self.messages(names):
             for message in messages:
                 with self._faults():
@@ -174,7 +174,7 @@ class Recording:
 
     @property
     def conclusion(self) -> Conclusion:
-        """Return the facts that the run stated at its end. All are None if the file has no index."""
+        """Return the facts that the run stated at its end. All facts are None if the file has no index."""
         if self.closed:
             with self._faults():
                 for record in self._mcap.extras():
@@ -225,7 +225,7 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
         paths: Files, and folders in which recordings are looked for at any depth.
 
     Returns:
-        The given files and the recordings in the folders, each once. Those of one folder are sorted by their paths.
+        The given files and the recordings in the folders, each once. The recordings of one folder are sorted by path.
 
     Raises:
         RecordingError: If a path does not exist, or if a folder has no recording.
@@ -247,12 +247,12 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class EpisodeSpan:
-    """The time span of an episode within a run, and the operator's marks on it. Times are since the run began [s]."""
+    """The time span of an episode within a run, with the operator's marks. Times count from the run's start [s]."""
 
     start: float = -math.inf
     end: float = math.inf  # inf stands for the end of the run.
     discarded: bool = False  # True if the operator discarded the episode.
-    success: bool | None = None  # None if it is not known.
+    success: bool | None = None  # True if the episode succeeded; None if that is not known.
     number: int = 0  # The number of the episode, from 1 on; 0 is the whole run.
     # Times at which the operator began another subtask [s]. The first subtask begins with the episode.
     subtask_starts: tuple[float, ...] = ()

@@ -23,7 +23,7 @@ from q2r2_control.types import QUEST_CONTROLS, HandSample, HapticFeedback
 class RecordedHands:
     """An input that plays the samples of a recording once. It begins with the first poll.
 
-    After the last recorded tick it is not connected any more, so the arms pause.
+    After the last recorded tick, the input is not connected any more, so the arms pause.
     """
 
     options = ("recording", "fast", "say")
@@ -59,10 +59,11 @@ class RecordedHands:
         self.controls = replace(QUEST_CONTROLS, buttons=buttons, words=words)
         self._say = say
         # All times below count from the first recorded tick, or from the first poll [s].
-        self._samples: list[tuple[float, list[HandSample]]] = []  # The ticks with samples: their times and samples.
-        self._changes: list[tuple[float, bool]] = []  # Times from which the hands were connected, or were not.
+        self._samples: list[tuple[float, list[HandSample]]] = []  # The time and the samples of each tick with samples.
+        self._changes: list[tuple[float, bool]] = []  # Times [s] from which the hands are connected or not.
         ticks = RecordedTicks(recording)
-        self._begins = ticks.next.now if ticks.next is not None else ticks.start.now  # By the recorded clock.
+        # The time of the first tick, or of the start if there is no tick, by the recorded clock [s].
+        self._begins = ticks.next.now if ticks.next is not None else ticks.start.now
         while ticks.next is not None:
             tick = ticks.advance()
             self._ends = tick.now - self._begins
@@ -82,7 +83,7 @@ class RecordedHands:
         fast: bool = False,
         say: Callable[[str], None] = lambda line: None,
     ) -> RecordedHands:
-        """Read the samples of ``recording``. They are the same at any pace, so ``fast`` has no effect."""
+        """Read the samples of ``recording``. The samples are the same at any pace, so ``fast`` has no effect."""
         if recording is None:
             raise ConfigError("--input recording needs --recording FILE")
         return cls(Path(recording), config, say)

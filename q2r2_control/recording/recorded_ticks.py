@@ -26,7 +26,7 @@ _SAME_POSE = 1e-6  # Two poses are equal if each number of their positions [m] a
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
-    """One tick of a recording, with all data that the loop took in it."""
+    """One tick of a recording, with all data that the loop received in this tick."""
 
     number: int
     now: float

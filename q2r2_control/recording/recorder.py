@@ -90,8 +90,8 @@ class BaseRecorder:
     def _send(self, batch: list[PackedTick] | list[Message] | list[CodedPicture], *, wait: bool = False) -> bool:
         """Send a batch to the writer. Return whether it was sent.
 
-        It is not sent after a failure, or if too much data waits already. If ``wait`` is True, wait until less data
-        waits.
+        The batch is not sent after a failure, or if too much data waits already. If ``wait`` is True, wait until less
+        data waits.
         """
         if self.writer is None or self.fault is not None:
             return False
@@ -212,7 +212,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self._waits = waits
         self._count = 0  # The number of ticks so far.
         self.overflows = 0  # The number of ticks that were lost because too much data waited.
-        self._packer: TickPacker | None = None  # None before :meth:`begin`.
+        self._packer: TickPacker | None = None  # Packs the ticks; None before :meth:`begin`.
         self._batch: list[PackedTick] = []
         # For each batch that is not yet written, the number of ticks up to its end, and the loop's time at its end [s].
         self._sent: deque[tuple[int, float]] = deque()
@@ -299,7 +299,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self._said_so = behind > (_CAUGHT_UP if self._said_so else _BEHIND)
 
     def _write_picture(self, picture: Message) -> None:
-        """Send a picture of a simulated camera to the writer, and wait until less data waits if necessary.
+        """Send a picture of a simulated camera to the writer. If too much data waits, first wait until less data waits.
 
         The thread that receives the pictures calls this method, so the loop need not wait.
         """

@@ -1,4 +1,4 @@
-"""Runs a recording again, in the pipeline's own loop. The recorded data replaces its clock, input and plant."""
+"""Runs a recording again, in the pipeline's own loop. Recorded data replaces the loop's clock, input and plant."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Replay:
 
     ticks: int  # The number of ticks that were replayed.
     summary: RunSummary | None  # The summary of the replay; None if it ended before its first tick.
-    # The fault that ended the replay, or the reason why it ended earlier than the recorded run; None if neither.
+    # The fault that ended the replay, or the reason why it ended earlier than the recorded run; otherwise None.
     ended_by: str | None
     # The first difference between replay and recording in words; None if there is none or nothing was compared.
     difference: str | None
@@ -287,7 +287,7 @@ class _PlantDifference:
     def __init__(self, robot: Robot, ticks: RecordedTicks) -> None:
         self._robot, self._ticks = robot, ticks
         self._data = robot.model.createData()
-        # By arm, the distance [m] and the angle [rad] at each tick.
+        # For each arm: the distance [m] and the angle [rad] at each tick.
         self._off: dict[str, list[tuple[float, float]]] = {name: [] for name in robot.arms}
 
     def __call__(self, tick: Tick) -> None:

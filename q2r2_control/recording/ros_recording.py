@@ -1,7 +1,7 @@
 """Reads a recording of the ROS nodes as if one loop had made it.
 
-Each tick of the controller's node becomes a tick. It has the newest joint states, flags of the arms and targets that
-had been received by then. Its reference is the reference message with the same time as the tick.
+Each tick of the controller's node becomes one tick. It has the newest joint states, flags of the arms and targets that
+had been received before the tick's message. Its reference is the reference message with the same time as the tick.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def open_recording(path: Path) -> Recording:
 class RosRecording(Recording):
     """A recording of the ROS nodes, which is read as ticks.
 
-    :meth:`chunks` raises :class:`RecordingError` if another controller than the built-in one moved the arms.
+    :meth:`chunks` raises :class:`RecordingError` if a controller other than ours moved the arms.
     """
 
     def chunks(self) -> Iterator[TickChunk]:
@@ -114,13 +114,13 @@ class RosTicks:
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
         self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
-        self._targets: dict[int, tuple[int, Array]] = {}  # By the arm's index, the time of receipt [ns] and the pose.
+        self._targets: dict[int, tuple[int, Array]] = {}  # Each arm's target: time of receipt [ns], pose.
         self._samples: list[Array] = []
         self._events: list[Event] = []
         self._due: deque[_Tick] = deque()  # Ticks that wait for their references.
         # References that wait for their ticks: the controller's time [s], and q, v and a (3, joints).
         self._references: deque[tuple[float, Array]] = deque()
-        # The newest tick has these two: the index that the controller gave it, and its number in this recording.
+        # The index that the controller gave to the newest tick, and the number of this tick in the recording.
         self._last_index, self._number = 0, -1
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             names.JOINT_STATES: self._on_joints,

@@ -25,7 +25,7 @@ class TickChunk:
     rows: Rows  # (n,) Rows with the dtype that tick_type returns.
     times: npt.NDArray[np.int64]  # (n,) The Unix times [ns].
     samples: Array  # (m, len(SAMPLE_FIELDS)) The m samples that the n ticks took.
-    states: dict[int, str]  # By the number of a tick, its state as JSON.
+    states: dict[int, str]  # The states of ticks as JSON. The keys are the ticks' numbers.
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:
@@ -33,7 +33,7 @@ class TickChunk:
         return np.asarray(self.rows["index"].astype(np.int64))
 
     def events(self) -> dict[int, list[Event]]:
-        """Return the events by the number of their tick.
+        """Return the events of each tick, by the number of the tick.
 
         Raises ValueError, KeyError and TypeError if a state is not JSON or has other fields.
         """
@@ -69,8 +69,8 @@ class TickAssembly:
     def rest(self, ended: bool) -> Iterator[TickChunk]:
         """Yield the ticks that are left. ``ended`` is True if the file was written to its end.
 
-        Otherwise the last tick is left out if some of its samples are missing. Raises :class:`ValueError` if ticks are
-        not in order, and the errors of rosbags if a message has another type.
+        If ``ended`` is False, and some samples of the last tick are missing, this tick is left out. Raises
+        :class:`ValueError` if ticks are not in order, and the errors of rosbags if a message has another type.
         """
         if not any(self._found.values()):
             return

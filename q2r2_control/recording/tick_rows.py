@@ -96,7 +96,7 @@ def numbers_in(rows: Rows) -> Array:
 def targets_or_tools(rows: Rows) -> Array:
     """Return the operator's targets (n, arms, 7) as x y z [m] qx qy qz qw in the world.
 
-    Where an arm has no target, its tool pose at the reference stands instead.
+    If an arm has no target, its tool pose at the reference is used instead.
     """
     targets, tools = rows["arms"]["target"], rows["arms"]["tool"]
     return np.where(targets.any(axis=2, keepdims=True), targets, tools)

@@ -79,7 +79,7 @@ class TickEncoder:
         self._slot = -1.0  # The newest tick is in this period of the standard topics; periods are counted from 0.
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # The time of the loop's clock at the start of the run [s].
-        self._stamps: dict[tuple[float, int], float] = {}  # By hand and column, the stamp of the last sample.
+        self._stamps: dict[tuple[float, int], float] = {}  # The stamp of the last sample, for each hand and column.
         self._templates = _templates(list(robot.joints))
         self._poses = {
             frame: MessageTemplate(messages.POSE, messages.pose_stamped(np.arange(1.0, 8.0), frame), 7)
@@ -143,7 +143,7 @@ class TickEncoder:
     def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
         """Convert times of the loop's clock [s] to Unix times [ns].
 
-        NaN becomes the start of the run. Times that do not fit into a stamp become the nearest time that does.
+        NaN becomes the start of the run. Times that do not fit into a stamp become the nearest time that fits.
         """
         assert self._start is not None
         passed = np.clip(np.nan_to_num(seconds - self._start) * NANOSECONDS, -_LAST_TIME, _LAST_TIME)
@@ -203,7 +203,7 @@ def _templates(joints: list[str]) -> dict[str, MessageTemplate]:
 
 @dataclass(frozen=True)
 class RecordingSetup:
-    """The first request to the writer's process: what it needs to begin a file."""
+    """The first request to the writer's process, with the data that the process needs to begin a file."""
 
     path: Path  # The path of the file, in a folder that exists.
     about: About
@@ -217,7 +217,7 @@ class Written(NamedTuple):
     """An answer of the writer's process: how many ticks and messages are in the file so far."""
 
     ticks: int = 0
-    messages: int = 0  # The number of messages and pictures that were sent as such, and not within ticks.
+    messages: int = 0  # The number of messages and pictures that were sent singly, and not within ticks.
 
 
 def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:

@@ -25,9 +25,9 @@ class Request(NamedTuple):
 # A function of the tick within the segment and of the last reference's joint positions (nv,), which returns a request.
 Stream = Callable[[int, Array], Request]
 _TABLE = 0.2  # Height of the table's top, on which tools press, as in the shipped cells [m].
-_TICK = 0.001  # Time by which a work motion at its usual speed goes on in a tick [s].
-# A gain changes to its first value times one of these factors. A small separation gain slows the arms long before
-# contact, which tests little.
+_TICK = 0.001  # In each tick, a work motion at its usual speed goes on by this time [s].
+# A gain changes to its value at the start, times one of these factors. With a smaller separation gain, the arms would
+# be slow long before contact, which would test little.
 _GAIN_SHARES = {
     **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
     **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},
@@ -263,7 +263,7 @@ class HostileChanges:
         return str(self._grasps.choice(self._with_object)), bool(self._grasps.random() < 0.7)
 
     def settings(self) -> dict[str, float] | None:
-        """Return a new value of one setting by its name, or None for no change: another distance or another gain."""
+        """Return the name and the new value of one setting, a distance or a gain; None for no change."""
         random = self._changes
         if random.random() > 0.01:
             return None

@@ -24,8 +24,8 @@ class AveragedCommands:
     """Averages one reference after another, as a drive does, and measures the resulting commands.
 
     Jerk and acceleration are differences of commands in ticks of exactly one period. Distances are checked only if the
-    bodies did not change in the command's whole window. After a change of fingers or objects, the new bodies are those
-    of the newest reference, and not those of the command.
+    bodies did not change in the command's whole window. After a change of fingers or objects, only the new bodies are
+    known, but the command is also a mean of references with the earlier bodies.
     """
 
     def __init__(self, robot: Robot, settings: ControllerSettings, measured: MeasuredDistances) -> None:
@@ -34,12 +34,12 @@ class AveragedCommands:
         self._acceleration = robot.capped_acceleration(settings.acceleration_limit)
         limit = settings.jerk_limit
         self._jerk = np.broadcast_to(np.inf if limit is None else np.asarray(limit, float), self._acceleration.shape)
-        # (p,) By this much, the distance of a pair at a command may be below its kept distance [m].
+        # (p,) The distance of a pair at a command may be smaller than its kept distance by at most this number [m].
         self._allowance = average_allowance(robot, settings, robot.collision_model)
         self._window = 2 * round(self._average.delay / _PERIOD) + 1  # Number of references in a mean.
         self._commands: deque[Array] = deque(maxlen=4)
         self._kept: deque[Array] = deque(maxlen=self._window)  # Kept distances (p,) at the newest regular ticks [m].
-        self._regular = 0  # Number of regular ticks since the last irregular one.
+        self._regular = 0  # Number of regular ticks since the last irregular tick.
 
     def start(self, q: Array) -> None:
         """Begin again at ``q`` (nv,) [rad], after a reset."""
@@ -49,7 +49,7 @@ class AveragedCommands:
         self._regular = 0
 
     def bodies_changed(self) -> None:
-        """Note that the opening of a gripper, or what it holds, has changed."""
+        """Forget the kept distances, because the opening of a gripper or the object in a gripper has changed."""
         self._kept.clear()
 
     def update(self, q: Array, v: Array, h: float) -> dict[str, float]:

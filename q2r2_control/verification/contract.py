@@ -96,9 +96,9 @@ class Contract:
         self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
-        """Note that the controller has accepted ``openings``.
+        """Take the ``openings`` that the controller has accepted.
 
-        ``before_step`` is False if this is known only after a step, from its reference.
+        ``before_step`` is False if it is known only after a step that the controller has accepted them.
         """
         if before_step:
             self._stop = self._controller.stop_deceleration
@@ -135,7 +135,7 @@ class Contract:
     def check(
         self, reference: Reference, dt: Any, unusable: frozenset[str] | None = None, failed: bool = False
     ) -> None:
-        """Like :meth:`observe`. Raises :class:`AssertionError` with the broken promises and the values seen."""
+        """Check one tick as :meth:`observe` does. Raises :class:`AssertionError` with the broken promises."""
         if broken := self.observe(reference, dt, unusable, failed):
             found = "; ".join(self.margins[key].described(value) for key, value in broken.items())
             raise AssertionError(f"tick {self.ticks - 1}: {found}")
@@ -191,7 +191,7 @@ class Contract:
         self.ticks += 1
 
     def tail_acceleration(self, duration: float = 0.5) -> float:
-        """Return the norm over the joints of the RMS acceleration over the last ``duration`` [s], in rad/s^2."""
+        """Return the RMS, over the last ``duration`` [s], of the norm of all joints' accelerations [rad/s^2]."""
         total, time = 0.0, 0.0
         for h, square in reversed(self._newest):
             total, time = total + square, time + h
@@ -275,7 +275,7 @@ class Contract:
     def _check_tools(self, q: Array, v: Array) -> None:
         """Check the speeds of the tools at ``q`` [rad] and ``v`` [rad/s].
 
-        Both are (nv,), or have one such row for each instant.
+        Both have the shape (nv,), or the shape (n, nv) with a row for each of n instants.
         """
         if self._tool_limit is not None and self._certain:
             self._note("tool_speed", self._tools.fastest(q, v) / self._tool_limit)

@@ -158,7 +158,7 @@ class Segment:
     targets: str  # Name of the stream of targets.
     timing: str  # Kind of the ticks' durations.
     ticks: int  # Number of ticks.
-    start: Start | None  # None if it continues from the end of the last segment.
+    start: Start | None  # The first state; None if the segment continues from the last one.
     fault: str | None  # The fault of the solver; None if the solver works.
     fault_period: int  # The solver fails in every second period of this many ticks. An attack lasts the whole segment.
     stream: Stream
@@ -274,7 +274,8 @@ class Starts:
         return q
 
 
-# Pairs that may touch: with TABLE_ONLY, fingers and the table; with FINGERS, also fingers of both hands.
+# Pairs that may touch. With TABLE_ONLY, fingers may touch the table. With FINGERS, they may also touch the other arm's
+# fingers.
 TABLE_ONLY = (ContactPair(pair=("*_finger_*", "table")),)
 FINGERS = (*TABLE_ONLY, ContactPair(pair=("left_*_finger_*", "right_*_finger_*"), depth=0.005))
 

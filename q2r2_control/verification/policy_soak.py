@@ -35,7 +35,7 @@ STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late
 _MOST, _LONGEST = 8, 0.4  # Largest number of actions in a chunk, and longest duration of a chunk [s].
 _STOPS = 1.0  # Time in which all arms have to come to rest after the last action that is followed [s].
 _PERIODS = (0.02, 0.1)  # Range of the time between two actions [s].
-_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Coordinates of far targets for tools, in any order [m].
+_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Each coordinate of a far target is one of these [m].
 
 
 class _Segment(NamedTuple):
@@ -46,7 +46,7 @@ class _Segment(NamedTuple):
     ticks: int
     every: int  # Number of ticks from one chunk to the next.
     step: float  # Largest step of an action [m or rad].
-    goal: Array  # The action to which most streams lead.
+    goal: Array  # The goal of most streams, as an action.
 
 
 class HostilePolicy:
@@ -75,7 +75,7 @@ class HostilePolicy:
         return found
 
     def draw(self, segment: _Segment, tick: Tick) -> tuple[Any, Any]:
-        """Return random actions (n, size) and their times (n,) [s]. In some kinds of streams, either may be invalid."""
+        """Return random actions (n, size) and their times (n,) [s]. Actions or times of some streams are invalid."""
         random, names = self._random, action_names(self._robot, segment.space)
         count = int(random.integers(1, _MOST + 1))
         period = random.uniform(*_PERIODS)
@@ -105,7 +105,8 @@ class HostilePolicy:
     def goal(self, stream: str, space: ActionSpace, step: float) -> Array:
         """Return a random goal of a stream (size,).
 
-        It is an action to which most streams lead. In the space of tool motions, it is the motion in each action.
+        The goal is an action. The actions of most streams approach it step by step. In the space of tool motions, the
+        goal is the motion in each action.
         """
         random, robot = self._random, self._robot
         q = self._posture()

@@ -20,7 +20,7 @@ from q2r2_control.types import Array, Interval, StepReport
 RELATIVE = 1e-9  # Relative tolerance of the limits in the contract.
 COAL = 2e-6  # Largest error of Coal's distance between a capsule and a box [m].
 
-PROMISES = {  # By key: name, unit, comparison and bound of the value.
+PROMISES = {  # For each key: name, unit, comparison and bound of the value.
     "exceptions": ("exceptions raised by step", "", "<=", 0.0),
     "not_finite": ("references that are not finite", "", "<=", 0.0),
     "unreported": ("unusable targets not reported", "", "<=", 0.0),
@@ -97,8 +97,8 @@ class Margin:
 class MeasuredDistances:
     """Margins of all monitored pairs and of the pairs of held objects: distances minus the kept distances.
 
-    ``kept`` (p,) has the kept distances of monitored pairs, and ``held`` (o,) those of pairs of held objects [m]. A
-    pair whose kept distance is minus infinity does not count.
+    ``kept`` (p,) has the kept distances of monitored pairs, and ``held`` (o,) has the kept distances of pairs of held
+    objects [m]. A pair whose kept distance is minus infinity does not count.
     """
 
     def __init__(self, robot: Robot, kept: Array) -> None:
@@ -109,7 +109,7 @@ class MeasuredDistances:
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
         self._fingers: CoalDistances | None = None  # None if fingers may be anywhere between open and closed.
         objects = robot.objects.geometry.copy()
-        for pair in robot.collision_model.collisionPairs:  # All pairs are removed except those of objects.
+        for pair in robot.collision_model.collisionPairs:  # Only the pairs of objects are kept.
             objects.removeCollisionPair(pair)
         self._of_objects = CoalDistances(robot.model, objects)
         self.forget()
@@ -136,7 +136,7 @@ class MeasuredDistances:
         return np.asarray(self._values(q) - self.kept + self._at_corners)
 
     def reported_margin(self, report: StepReport) -> float:
-        """Return the least margin of a report [m]: that of its tightest pair, or of its nearest pair by ``kept``."""
+        """Return the smaller of two margins in a report [m]: of its tightest pair, and of its nearest pair."""
         closest = frozenset(report.closest_pair)
         if closest in self._objects:
             return report.margin
@@ -146,8 +146,9 @@ class MeasuredDistances:
     def compare(self, q: Array, report: StepReport) -> tuple[Array, list[float]]:
         """Return the margins (p,) [m], and the errors of the least distance and margin in a report [m].
 
-        Some pairs are not compared. Coal defines the depth of a penetration differently. Boxes that may be touched are
-        rounded for the controller. Pairs of objects and of moving obstacles are not among the monitored pairs.
+        There are no errors while a pair is in penetration, because Coal defines the depth differently. Pairs that may
+        touch are not compared, because the controller rounds their boxes. Pairs of held objects and of moving obstacles
+        are not compared, because they are not among the monitored pairs.
         """
         values, margins = self._values(q), self.margins(q)
         closest, tightest = frozenset(report.closest_pair), frozenset(report.tightest_pair)

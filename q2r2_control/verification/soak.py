@@ -63,7 +63,7 @@ class Violation:
     since_segment: int  # Number of ticks since the segment began.
     q: Array  # (nv,) Reference before the tick [rad].
     v: Array  # (nv,) Velocity of the reference before the tick [rad/s].
-    targets: dict[str, Any]  # By arm, a homogeneous matrix (4, 4), or the text of a target that is no pose.
+    targets: dict[str, Any]  # For each arm, a homogeneous matrix (4, 4), or the text of a target that is no pose.
     dt: str  # Duration of the tick, as text.
     error: str  # Text of the exception; empty if there was none.
 
@@ -104,11 +104,11 @@ def run_soak(
 ) -> SoakReport:
     """Run a soak of the controller of a cell.
 
-    At ticks without an injected fault, ``solver`` is used; the cell's solver if it is None.
+    At ticks without an injected fault, ``solver`` is used. If it is None, the cell's solver is used.
     """
     robot = Robot.from_config(config)
     settings = config.control.timed(realtime=True)
-    # The solver gets no time limit, because a soak that finds a fault has to find it again.
+    # The solver gets no time limit, so that a soak with the same seed finds the same faults again on any computer.
     simulated = config.control.timed(realtime=False)
     inner = solver_of(simulated, robot.model.nv) if solver is None else Guard(solver, robot.model.nv)
     name = config.control.solver if solver is None else type(solver).__name__
@@ -249,9 +249,9 @@ def steady_growth(memory: Sequence[float | None]) -> float | None:
 
 
 def _memory_mb() -> float | None:
-    """Return the memory of this process after garbage collection, without files [MB]; None if it is not known.
+    """Return the memory of this process after garbage collection, without pages of files [MB]; None if unknown.
 
-    Files are left out, because pages of a library become resident at the first call of a function, at any time.
+    Pages of files are left out, because pages of a library become resident when a function is first called.
     """
     gc.collect()
     try:

@@ -19,7 +19,7 @@ class MeasuredToolSpeeds:
     def fastest(self, q: Array, v: Array) -> float:
         """Return the speed of the fastest tool's origin [m/s].
 
-        ``q`` [rad] and ``v`` [rad/s] are (nv,), or have one such row for each instant.
+        ``q`` [rad] and ``v`` [rad/s] have the shape (nv,), or the shape (n, nv) with a row for each of n instants.
         """
         return max(map(self._fastest, np.atleast_2d(q), np.atleast_2d(v)))
 

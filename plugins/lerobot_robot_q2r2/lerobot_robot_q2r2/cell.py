@@ -1,7 +1,7 @@
 """A robot for lerobot that drives a cell. lerobot reads its observations and sends it actions, as with other robots.
 
-The features of this robot have the same names and order as those of ``q2r2 export lerobot``. Therefore a policy that
-was trained on such a dataset can drive it.
+The features of this robot have the same names and order as the features of a dataset from ``q2r2 export lerobot``.
+Therefore a policy that was trained on such a dataset can drive this robot.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _BEGINS = 60.0
 @RobotConfig.register_subclass("q2r2_cell")
 @dataclass(kw_only=True)
 class Q2R2CellConfig(RobotConfig):
-    cell: str = "config/dual_iiwa7.yaml"  # Path of a cell's YAML, which may be a shipped one. Its cameras are used.
+    cell: str = "config/dual_iiwa7.yaml"  # Path of the YAML of any cell. The cameras of this cell are used.
     plant: str | None = None  # Name of an installed plant, such as fri; None for the cell's own plant.
     rate: float = 30.0  # Rate of the actions [Hz].
     simulated_time: bool = False  # If true, time is simulated: it advances by 1 / rate with each action.
@@ -194,7 +194,7 @@ class Q2R2Cell(Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Send an action. An action that does not come from the hands comes from the policy.
 
-        With such an action, the policy takes over the arms if the hands had them.
+        If the hands moved the arms until now, such an action lets the policy take over the arms.
         """
         self._check()
         before, self._by_policy = self._by_policy, not self._asked

@@ -10,7 +10,7 @@ from q2r2_control.inputs import WebInput
 
 
 class HandsDoor:
-    """An :class:`Input` with the samples of the device that is attached, or without samples if the policy has the arms.
+    """An :class:`Input` with the samples of the attached device, but without samples while the policy moves the arms.
 
     It is the input with which a person can take over from the cell's policy.
     """

@@ -1,8 +1,8 @@
 """Answer the robots in a process of its own, so that a robot need not wait for a tick of the loop.
 
-The loop sends commands to this process. The process replies whether they came in time. After each state of a robot, it
-sends the state of the robot's session to the loop. Whatever ends the loop, the process goes on until the arms have come
-to rest by their certified stops.
+The loop sends commands to this process. The process replies whether the commands came in time. After each state of a
+robot, it sends the state of the robot's session to the loop. Whatever ends the loop, the process goes on until the arms
+have come to rest by their certified stops.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class RobotAnswers(AnsweringProcess):
 
 
 def main(commands: int, states: int) -> None:
-    """Answer the robots until the loop has ended and the arms are at rest. This is what the process runs."""
+    """Answer the robots until the loop has ended and the arms are at rest. The process runs this function."""
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
@@ -81,7 +81,7 @@ def main(commands: int, states: int) -> None:
         except Exception as error:
             with suppress(OSError):
                 from_loop.send(reason_of(error).encode())
-    # The process ends without destructors, because the library's would wait for robots that are no longer connected.
+    # The process ends without running destructors, because the library's destructors would wait for lost robots.
     os._exit(0)
 
 
@@ -154,7 +154,7 @@ class _Answering:
         self._tell(arm)
 
     def _write(self, arm: str, values: Array, begins: bool = False) -> None:
-        """Add ``values`` to the record: a command, or, if ``begins``, the values that the robot holds at the start."""
+        """Add ``values`` (7,) to the record: a command, or, if ``begins`` is True, the values when a motion begins."""
         newest = self._sessions[arm].state.newest
         if self._record is not None and newest is not None:
             is_torque = self._mode is CommandMode.TORQUE
@@ -163,11 +163,11 @@ class _Answering:
             write_entry(self._record, entry)
 
     def _tell(self, arm: str) -> None:
-        with suppress(OSError):  # If the loop reads nothing, the socket is full. The loop gets a later state.
+        with suppress(OSError):  # The socket is full if the loop reads too slowly. This state is then dropped.
             self._states.send(bytes([self._arms.index(arm)]) + pickle.dumps(self._sessions[arm].state))
 
     def _lost(self, arm: str, error: Exception) -> None:
-        """Note that a robot has ended its motion, or that its connection is lost. Then brake all arms."""
+        """Store that a robot has ended its motion, or that its connection is lost. Then brake all arms."""
         link, session = self._links[arm], self._sessions[arm]
         session.end(reason_of(error))
         link.drop_motion()
@@ -178,7 +178,7 @@ class _Answering:
     def _lose(self, arm: str) -> None:
         """Drop a lost connection. The last state stays, because the loop needs a state at every tick.
 
-        Its mode becomes ABSENT.
+        The mode in this state becomes ABSENT.
         """
         self._links[arm].lose()
         if (newest := self._sessions[arm].state.newest) is not None:
@@ -214,7 +214,7 @@ class _Answering:
         return False
 
     def _finish(self) -> None:
-        """End the motions of all arms, which are at rest. Afterwards their robots hold them."""
+        """End the motions of all arms, which are at rest. Afterwards each robot holds its arm by itself."""
         for arm, session in self._sessions.items():
             if session.state.controlled:
                 try:
@@ -235,7 +235,7 @@ class _Answering:
             for arm, link in self._links.items():
                 session = self._sessions[arm]
                 if link.is_open and session.state.is_silent(now) and not select.select([link.file], (), (), 0)[0]:
-                    self._lose(arm)  # The robot's control has no power or no network any more.
+                    self._lose(arm)  # The robot is silent, so its control has lost its power or its network.
                 if not link.is_open:
                     link.open()
                     session.hear(link.read(), time.monotonic())

@@ -1,11 +1,11 @@
 """Turn the ticks of the loop into commands for the sessions of all arms.
 
-**The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, one
-millisecond of it passes, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
-the loop extends the reference so far that no robot reaches the end of the reference before the next tick has come,
-unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the
-robots get the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first.
-If a robot reaches the end while a tick is computed, the sessions refuse the command of this tick, and it is withdrawn.
+**The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, this time
+advances by 1 ms, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of the loop
+extends the reference so far that no robot reaches the end of the reference before the next tick has come, unless the
+next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the robots get the
+certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first. If a robot
+reaches the end while a tick is computed, the sessions refuse this tick's command, and the command is withdrawn.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _PASSING = 0.0015  # Approximate time that a measurement takes to pass through n
 
 
 class FrankaCell:
-    """The states of all sessions as the loop knows them. It computes the commands for the sessions from them."""
+    """The states of all sessions as the loop knows them. This class computes the commands from these states."""
 
     def __init__(self, robot: Robot, states: Iterable[SessionState], period: float, longest: float) -> None:
         """Take the first states of the sessions.
@@ -46,7 +46,7 @@ class FrankaCell:
             robot: The robot.
             states: The state of each arm's session.
             period: Period of the loop [s].
-            longest: The longest step of the reference in one tick [s]. A step has one acceleration.
+            longest: The longest step of the reference in one tick [s]. The acceleration is constant within a step.
         """
         self.states = {state.arm: state for state in states}
         self._robot, self._period, self._longest = robot, period, longest
@@ -64,8 +64,8 @@ class FrankaCell:
     def due(self, now: float) -> tuple[float, float]:
         """Return two durations of the reference's motion in the tick at ``now`` [s].
 
-        During the first time, the reference follows the earlier certified stop; it may be 0. During the second time, it
-        moves on.
+        During the first one, which may be 0, the reference follows the certified stop of an earlier tick. During the
+        second one, it makes the motion of this tick.
         """
         following = [state for state in self.states.values() if state.following]
         late = now - self._now if following else 0.0
@@ -95,7 +95,7 @@ class FrankaCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # The deceleration is None if the reference is at rest. Any positive number will then do.
+            # The deceleration is None if the reference is at rest. Then any positive number can be used.
             stop = (1.0,) * JOINTS if deceleration is None else tuple(deceleration[joints].tolist())
             q, v = tuple(command.q[joints].tolist()), tuple(command.v[joints].tolist())
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -124,7 +124,7 @@ class FrankaCell:
         return {arm: state.ended for arm, state in self.states.items()}
 
     def sent(self, taken: bool) -> None:
-        """Record whether the sessions have ``taken`` the commands of a tick. They refuse all if one came too late."""
+        """Store whether the sessions have ``taken`` a tick's commands. They refuse all if one command came too late."""
         self._withdraws = not taken
         if taken:
             self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
@@ -132,13 +132,13 @@ class FrankaCell:
             self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
 
     def withdraws(self) -> bool:
-        """Return whether the newest commands came too late. The arms then follow the stop after the commands before."""
+        """Return whether the newest commands came too late. The arms then follow the stop of the previous commands."""
         return self._withdraws
 
     def delay(self) -> float:
-        """Return the time from the end of a command until a tick measures the arm there [s].
+        """Return the delay of measurements [s]; see :meth:`SessionPlant.delay`.
 
-        It is 0 for torques, which act at once.
+        It is 0 in torque mode, because torques act at once.
         """
         if any(state.wanted is CommandMode.TORQUE for state in self.states.values()):
             return 0.0
@@ -149,7 +149,7 @@ class FrankaCell:
         return self._longest_tick + self._margin + PERIOD
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of all arms whose robots were heard."""
+        """Return the timing of all arms whose robots have sent a state."""
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 
     @property
@@ -158,7 +158,7 @@ class FrankaCell:
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Return the measurements of the robots. Its stamp is the arrival time of the oldest state."""
+        """Return the measurements of the robots. Their stamp is the arrival time of the oldest state."""
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         for arm, state in self.states.items():
             joints, newest = self._joints[arm], state.newest

@@ -21,8 +21,8 @@ from q2r2_franka.record import Entry, entries_of
 from q2r2_franka.stream import robot_positions
 
 ARMS = "left", "right"
-# A share of a limit may exceed 1 by this, because a robot rounds positions to doubles. The third difference of this
-# rounding is far smaller.
+# A share of a limit may exceed 1 by this, because a robot rounds positions to doubles. The error that the rounding
+# causes in the jerk, which is a third difference, is far smaller.
 _ROUNDING = 1e-3
 
 

@@ -2,8 +2,8 @@
 
 The library has calls for whole motions, not for a stream of positions: ``move`` to a width, and ``grasp`` with a force.
 The loop commands openings, from 0 for closed to 1 for open. When a motion has ended, the fingers move to the newest
-commanded opening. Thus they follow a trigger in steps. A command to close is a grasp, which holds with its force
-whatever is between the fingers.
+commanded opening. Thus they follow a trigger in steps. If the hand is commanded to close, it grasps: the fingers then
+hold whatever is between them, with the force of the grasp.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Hand:
 def main(file: int, address: str, settings: dict[str, Any]) -> None:
     """Connect to the hand, and again after an error, and move the fingers until the loop has ended.
 
-    This is what the process runs.
+    The process runs this function.
     """
     import pylibfranka
 

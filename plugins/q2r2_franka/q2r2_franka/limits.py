@@ -19,7 +19,7 @@ ACCELERATION = 10.0  # Limit of every joint [rad/s^2].
 JERK = 5000.0  # Limit of every joint [rad/s^3].
 TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # Greatest torques [Nm].
 TORQUE_RATE = 1000.0  # Limit of every joint's torque rate [Nm/s].
-# Near a position limit, a joint at the distance d may have the velocity sqrt(_SLOPE d) - _OFFSET towards it.
+# At the distance d from a position limit, a joint's velocity towards this limit is at most sqrt(_SLOPE d) - _OFFSET.
 _OFFSET = np.array([0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35])  # [rad/s]
 _SLOPE = np.array([12.0, 5.17, 7.00, 8.00, 34.0, 11.0, 34.0])  # [rad/s^2]
 

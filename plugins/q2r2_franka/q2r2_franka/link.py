@@ -22,8 +22,8 @@ from q2r2_franka.state import Measured, Mode
 
 ERRORS = (RuntimeError, pylibfranka.FrankaException)
 _FILES = "/proc/self/fd"
-# The robot's own controller of joint positions. Settings in Desk may let it filter the commands. Its stiffness is not
-# changed here.
+# The robot's own controller of joint positions. Settings in Desk may let this controller filter the commands. Its
+# stiffness is not changed here.
 _CONTROLLER = pylibfranka.ControllerMode.JointImpedance
 # Python objects of lost connections. They must not be destroyed, because that would end the process.
 _kept: list[Any] = []
@@ -47,7 +47,7 @@ class ArmLink:
         return self._robot is not None
 
     def open(self) -> None:
-        """Connect, and set the robot's collision thresholds and load to those of the cell."""
+        """Connect, and set the robot's collision thresholds and load to the values in the cell."""
         before = _datagram_sockets()
         try:
             robot = pylibfranka.Robot(self._settings.address, self._real_time)

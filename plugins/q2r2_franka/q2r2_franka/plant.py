@@ -1,4 +1,4 @@
-"""One or two Franka arms as a plant. Its own process answers the robots, and gets the arms' motion from the loop."""
+"""One or two Franka arms as a plant. A separate process answers the robots, and gets the arms' motion from the loop."""
 
 from __future__ import annotations
 

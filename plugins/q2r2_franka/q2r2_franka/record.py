@@ -18,9 +18,9 @@ class Entry(NamedTuple):
     """One command, or the beginning of a motion."""
 
     arm: int  # 0 for left, 1 for right.
-    begins: bool  # True at the beginning of a motion. ``values`` are then those that the robot holds by itself.
+    begins: bool  # True at the beginning of a motion. Then ``values`` are what the robot holds by itself.
     is_torque: bool
-    # Number of periods since the entry before. Only in the last of them, the robot got a command.
+    # Number of periods since the previous entry. Only in the last of these periods, the robot got a command.
     cycles: int
     time: float  # Time by the monotonic clock [s].
     values: Array  # Positions [rad] or torques [Nm] (7,).

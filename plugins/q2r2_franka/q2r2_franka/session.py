@@ -15,17 +15,19 @@ from q2r2_franka.stream import PositionStream, TorqueStream
 
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _STILL = 0.02  # In torque mode, an arm counts as resting if all joints are slower than this [rad/s].
-# An arm may begin to follow a reference if each joint is nearer to it than this [rad]. The first number is for position
-# mode, in which the position that the arm holds counts. The second is for torque mode, with the measured position.
+# An arm may begin to follow a reference if each joint is nearer to it than this [rad]. In position mode, the positions
+# that the robot holds have to be within the first number. In torque mode, the measured positions have to be within the
+# second number.
 _SAME, _NEAR = 1e-6, 0.02
-# No joint has a greater acceleration in the first tick after rest [rad/s^2]. A faster reference was not at rest before.
+# No joint has a greater acceleration in the first tick after rest [rad/s^2]. If a joint of the reference is faster than
+# this acceleration allows after one tick, the reference was not at rest one tick ago.
 _FROM_REST = 20.0
 _TORQUE_LASTS = 0.02  # If the commanded torque is older than this, a torque that brakes the arm replaces it [s].
 _BRAKES = 1.0  # In torque mode, an arm is braked for at most this time. Then its robot holds it [s].
-# If one arm is ahead of the other arm on the reference, its time passes more slowly. _WAITING is the largest share by
-# which it does, and _WAITING_RAMP is the change of this share in a second [1/s]. So the robot's acceleration is at most
-# a + _WAITING_RAMP v, where a and v are those of the reference. The wanted share is _WAITING_GAIN [1/s] times the time
-# by which the arm is ahead.
+# If one arm is ahead of the other arm on the reference, the time of this arm passes more slowly. The share by which it
+# passes more slowly is at most _WAITING, and changes by at most _WAITING_RAMP in a second [1/s]. So the robot's
+# acceleration is at most a + _WAITING_RAMP v, where a and v are the acceleration and velocity of the reference. The
+# wanted share is _WAITING_GAIN [1/s] times the time by which the arm is ahead.
 _WAITING, _WAITING_RAMP, _WAITING_GAIN = 0.1, 0.4, 10.0
 _MOST_CYCLES = 100  # If more periods than this are lost, the robot has surely ended the motion itself.
 
@@ -34,7 +36,7 @@ class ArmSession:
     """The session of one arm.
 
     The commands of the arm lie on ``path``. While the arm follows the reference, each tick extends the path. Otherwise
-    the path ends with a stop, and the arm is held at its end.
+    the path ends with a stop, and the arm is held at the end of the path.
     """
 
     def __init__(self, arm: str, address: str, wanted: CommandMode, torque_limit: Array) -> None:
@@ -57,7 +59,7 @@ class ArmSession:
         state.rest = tuple(map(float, q))
 
     def end(self, problem: str) -> None:
-        """Note that commands no longer move the arm. ``problem`` says why."""
+        """Store that commands no longer move the arm. ``problem`` says why."""
         self.state.ended += self.state.following
         self.state.controlled = self.state.following = False
         self.state.problem = problem
@@ -160,9 +162,10 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 
 
 def ahead_of_others(sessions: Mapping[str, ArmSession], arm: str, now: float) -> float:
-    """Return the time by which an arm is ahead, on the reference, of the last other arm that follows [s]; at least 0.
+    """Return the time by which an arm is ahead of the other arm on the reference [s]; 0 if it is not ahead.
 
-    Also store in the arm's state the time by which the arm is behind the first other arm [s].
+    Only arms that follow the reference count. If there were several other arms, the hindmost would count. Also store in
+    the arm's state the time by which the arm is behind the other arm, or behind the foremost of several others [s].
     """
     state = sessions[arm].state
     others = [session.state for name, session in sessions.items() if name != arm and session.state.following]

@@ -58,7 +58,7 @@ class SessionState:
     address: str
     wanted: CommandMode = CommandMode.POSITION
     newest: Measured | None = None
-    arrival: float = -math.inf  # Arrival of the newest state.
+    arrival: float = -math.inf  # Time at which the newest state came.
     usual: float = PERIOD  # Usual time between two states.
     controlled: bool = False  # True while commands move the robot.
     following: bool = False  # True while the arm follows the reference.
@@ -83,7 +83,8 @@ class SessionState:
     def timing(self, now: float) -> ArmTiming:
         """Return the timing of the arm at ``now`` [s].
 
-        It has the arm's delay behind the other arm, the age of the newest state, and the usual time between states.
+        The timing has the arm's delay behind the other arm, the age of the newest state, and the usual time between
+        states.
         """
         behind = self.behind if self.wanted is CommandMode.POSITION else 0.0
         return ArmTiming(behind, now - self.arrival, self.usual)
@@ -128,10 +129,10 @@ class ArmCommand:
     """
 
     now: float  # Time of the tick by the monotonic clock [s].
-    start: float  # The reference leaves the earlier stop at this time of the reference [s].
-    end: float  # The step of this tick ends at this time of the reference [s].
+    start: float  # At this time of the reference [s], it leaves the earlier stop, and the step of this tick begins.
+    end: float  # At this time of the reference [s], the step of this tick ends.
     q: Joints  # Posture at the time ``end`` [rad].
     v: Joints  # Velocity at the time ``end`` [rad/s].
     deceleration: Joints  # Deceleration of the stop [rad/s^2].
-    tau: Joints | None = None  # Torques without gravity [Nm]; None with positions, or if the damping brakes.
-    damping: Joints | None = None  # Damping that brakes if no torques come [Nm s/rad]; None with positions.
+    tau: Joints | None = None  # Torques without gravity [Nm]; None in position mode, or if the damping brakes the arm.
+    damping: Joints | None = None  # Damping that brakes the arm if no torques come [Nm s/rad]; None in position mode.

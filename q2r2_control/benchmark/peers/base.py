@@ -16,7 +16,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# By the name of a peer, the package that it needs. The peer's module and class here have the name of the package.
+# The package that each peer needs. The peer's module and class in this folder have the name of the package.
 PEERS = {
     "roboplan": "roboplan",
     "roboplan, 10 nearest": "roboplan",
@@ -34,7 +34,7 @@ class BenchController(Protocol):
     """A controller that runs open loop: it starts each tick at the positions that it returned in the last tick."""
 
     name: str
-    limitations: str  # The parts of our contract that it cannot keep, in a few words.
+    limitations: str  # The parts of our contract that this controller cannot keep, in a few words.
 
     def reset(self, q: Array) -> None:
         """Start at rest at the posture ``q`` (nv,) [rad], in the order of ``Robot.joint_names``."""
@@ -60,7 +60,7 @@ class PeerSettings:
         self.robot, self.config, self.dt = robot, config, dt
         self.position_gain = control.position_gain * dt  # Share of the tool's position error that a tick removes.
         self.posture_gain = control.posture_gain * dt  # Share of the posture error that a tick removes.
-        self.posture_cost = float(control.posture_weight**0.5)  # A tool's cost is 1. A weight is a squared cost.
+        self.posture_cost = float(control.posture_weight**0.5)  # A tool's cost is 1. A weight is the square of a cost.
         self.velocity = robot.velocity_limit * control.velocity_scale  # (nv,) [rad/s]
         self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
         self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]

@@ -14,7 +14,7 @@ from q2r2_control.robot.urdf_parts import numbers
 
 
 def urdf_with_our_bodies(setup: PeerSettings) -> str:
-    """Return the cell's URDF with our bodies as collision shapes. Our margin is taken off its position limits."""
+    """Return the cell's URDF with our bodies as collision shapes. Its position limits are reduced by our margin."""
     root = ET.fromstring(setup.robot.urdf)
     for name, lower, upper in zip(setup.robot.joint_names, setup.lower, setup.upper, strict=True):
         limit = root.find(f"joint[@name='{name}']/limit")

@@ -6,7 +6,7 @@ consider braking distances. embodiK gets the same URDF as roboplan, with our bod
 pairs.
 
 Three of its settings are not the defaults. First, it has rows for the ten nearest pairs at any distance. By default, it
-has rows only for pairs within five times the kept distance, which is 5 mm here. Second, its mode is MIN_ERROR: tools
+has rows only for pairs within five times the kept distance, here within 5 mm. Second, its mode is MIN_ERROR: tools
 get as near to their targets as limits allow. In the default mode SCALE, it reduces a tool's whole velocity until all
 limits hold. A tool then stopped 47 mm from its target in free air. Third, both tools have the first priority, and the
 posture has the second one. In embodiK, weights are gains, so a small weight cannot make the posture less important than

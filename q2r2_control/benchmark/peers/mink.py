@@ -2,7 +2,7 @@
 
 mink has position and velocity limits and collision avoidance for chosen pairs of geometries, but no acceleration limit.
 Its collision bound is a distance divided by dt, but mink compares the bound with the displacement in one tick.
-Therefore it gets our gain times dt squared, so that its pairs approach each other as fast as ours. mink ignores pairs
+Therefore mink gets our gain times dt squared, so that its pairs approach each other as fast as ours. mink ignores pairs
 of a body and its parent. It gets the MuJoCo model of the simulation, with every monitored capsule. The fingers are
 joints in that model; equality constraints keep them still.
 """

@@ -3,8 +3,8 @@
 Pink has position, velocity and acceleration limits and a barrier on the nearest pairs. All of them are hard
 constraints. If they contradict each other, Pink raises an exception. The barrier does not consider braking distances.
 Pink gets the same Pinocchio model, capsules and pairs as our controller, and rows for the ten nearest pairs. With rows
-for all pairs, it would take six times as long. Its damping towards a safe displacement has the default gain 1. It is
-switched off here, because it slows down the tools at ticks of 1 ms.
+for all pairs, it would take six times as long. By default, its damping towards a safe displacement has the gain 1. Here
+this damping is switched off, because it slows down the tools at ticks of 1 ms.
 """
 
 from __future__ import annotations

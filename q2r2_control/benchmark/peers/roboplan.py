@@ -9,8 +9,8 @@ for the ten nearest pairs.
 By default, its solver looks for the nearest feasible problem if limits contradict each other. Tools then follow some
 targets more closely, but one tick took up to a minute, so this is switched off. The limit of iterations is a tenth of
 the default, because single ticks still took minutes. The tolerance of the solver is the default (1e-6 rad per tick),
-because with smaller tolerances a tick took up to two minutes. The damping towards a safe displacement has the default
-gain 1. It is switched off here, because with it the tools hardly follow at ticks of 1 ms.
+because with smaller tolerances a tick took up to two minutes. By default, the damping towards a safe displacement has
+the gain 1. Here this damping is switched off, because with it the tools hardly follow at ticks of 1 ms.
 """
 
 from __future__ import annotations
