@@ -58,7 +58,11 @@ class Plant(Protocol):
         """
 
     def advance(self, dt: float) -> None:
-        """Let ``dt`` [s], from 0 to 1, pass; raises :class:`PlantError` for another time, and nothing moves then."""
+        """Let the time ``dt`` pass, which is from 0 to 1 s.
+
+        Raises:
+            PlantError: If ``dt`` is not in this range. Nothing moves then.
+        """
 
     def state(self) -> RobotState:
         """Return the newest measurement, with a stamp of the plant's own clock, which starts at 0 on ``reset``.
@@ -134,9 +138,10 @@ class SessionPlant(Protocol):
         """Return how the motion of each arm is timed relative to the reference; empty if all arms have one timing."""
 
     def lead(self) -> float:
-        """Return the longest time by which commands are ahead of the arms [s].
+        """Return the longest time from the newest posture that was sent to an arm to the end of the newest step [s].
 
-        It is the end time of a tick's command, minus the time of the posture that is sent to the arms.
+        Both are times of the reference. They differ because the loop computes the reference some time before the plant
+        sends its postures to the arms.
         """
 
     def fault(self) -> Reason | None:

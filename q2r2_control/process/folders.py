@@ -22,7 +22,9 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
             folder.mkdir(parents=True)
             return folder
         except OSError as error:
-            if not (isinstance(error, FileExistsError) and folder.exists()):  # A parent may be a file.
+            # If the folder exists, the next number is tried. A broken link causes a FileExistsError too, but no number
+            # helps against it.
+            if not (isinstance(error, FileExistsError) and folder.exists()):
                 raise ConfigError(f"{what} {folder}: {error.strerror}") from error
     raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
 

@@ -214,7 +214,11 @@ class HandListeners:
             self._states.look()
 
     def unready(self) -> str | None:
-        """Return one line if an arm cannot be engaged yet, or may not have reported yet; else None."""
+        """Return one line that says why an arm cannot be engaged yet; None if there is no reason.
+
+        In the first two seconds, the node of an arm may not have been found yet. If no arm has
+        reported yet that it follows one of the hands, this is a reason as well.
+        """
         if time.monotonic() - self._began < _DISCOVERY and any(self.engaged(hand) is None for hand in self._hands):
             return "an arm may be there that has not said yet what it does"
         for name, state, age in self._arms():

@@ -230,7 +230,12 @@ class Supervisor:
         return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:
-        """Stop, or brake and activate the arms again, if they deviate too much or if their driver stands still."""
+        """Compare the arms with the reference, and react if they deviate too much or if a driver stands still.
+
+        Without an external controller, arms that deviate too much are stopped. With an external controller, they brake
+        and are activated again, and they are stopped only if a pair is too close. If a driver stands still, the arms
+        always brake and are activated again.
+        """
         away, state = self._watch.deviates(reference.q, now), self._watch.state
         standing = None if self._standing is None or state is None else self._standing.look(reference.q, state, now)
         if standing is not None:

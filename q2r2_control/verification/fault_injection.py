@@ -20,10 +20,12 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.adversary import Adversary, Stream
 
-# Answers of a solver that attacks. "towards_nearest" is the vertex of the QP's box at which the bodies of one of the
-# pairs with the least margins approach each other fastest. "corner" is a random vertex for some ticks. "again" is the
-# last answer, even if the box has changed since. "no_rows" is the QP's solution without separation rows, which leads
-# straight to the targets.
+# The attacks, which are ways in which a solver works against the arms:
+# - "towards_nearest": it chooses one of the pairs with the least margins. Its answer is the vertex of the QP's box at
+#   which the two bodies of this pair approach each other fastest.
+# - "corner": its answer is a random vertex of the box, which it keeps for some ticks.
+# - "again": it repeats its last answer, even if the box has changed since.
+# - "no_rows": it solves the QP without the separation rows. This solution leads straight to the targets.
 ATTACKS = ("towards_nearest", "corner", "again", "no_rows")
 _PATIENCE = 200  # Largest number of ticks for which an attack goes on with the same pair or the same corner.
 _CANDIDATES = 4  # An attack chooses one of this number of pairs with the least margins.

@@ -58,7 +58,8 @@ class TestTheShippedCellShowsAllThereIsToTune:
         lines = text.splitlines()
         for place, model, data in shown(Config, read_yaml(text)):
             if place == "arms.left" and "robot:" in text:
-                continue  # The block robot contains the arms, so this block lacks some keys.
+                # Here the block "robot" describes both arms, so the block "arms.left" lacks some keys.
+                continue
             for key in model.model_fields:
                 path = f"{place}.{key}".lstrip(".")
                 if path in self.SHOWN_ELSEWHERE:

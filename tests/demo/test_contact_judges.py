@@ -40,7 +40,7 @@ def test_strokes_of_300_mm_with_5_to_15_newtons_count_as_wiped() -> None:
         pytest.param([(0.4, 0.0)], LEFT, 1, id="in the air"),
     ],
 )
-def test_shorter_strokes_and_other_forces_do_not_count_as_wiped(
+def test_strokes_with_a_wrong_length_force_or_contact_do_not_count_as_wiped(
     strokes: Sequence[tuple[float, float]], touched: int, faults: int
 ) -> None:
     assert len(wiped(strokes, touched).faults()) == faults

@@ -7,7 +7,7 @@ import pytest
 from q2r2_control import ConfigError, Robot, load_config
 
 
-def test_a_jerk_limit_is_refused_if_the_mean_cannot_keep_it_or_pairs_would_not_keep_the_distance_of_the_mean() -> None:
+def test_a_jerk_limit_is_refused_if_averaged_commands_would_exceed_it_or_would_be_too_far_from_the_path() -> None:
     pytest.importorskip("pylibfranka", reason="pip install -e plugins/q2r2_franka")
     from q2r2_franka.plant import FrankaPlant
 

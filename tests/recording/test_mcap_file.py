@@ -138,7 +138,7 @@ def test_a_file_is_refused_if_it_is_sorted_by_topic_because_its_ticks_come_witho
 
 
 def test_a_cut_file_of_another_writer_is_read_up_to_the_cut(file: Path, ours: Read, tmp_path: Path) -> None:
-    """Only one tick is left out. The last whole chunk has some of this tick's messages, but not all of them."""
+    """The last whole chunk before the cut may end within a tick. Only this tick is left out of what is read."""
     again = written_again(file, tmp_path / "again.mcap", in_order(file), chunk_size=3_000)
     data, cut, lengths = again.read_bytes(), tmp_path / "cut.mcap", []
     for size in np.linspace(0.3, 0.95, 25) * len(data):

@@ -161,10 +161,10 @@ class RecorderNode(BaseNode):
         return self._epoch + round(monotonic * 1e9) - self._begun
 
     def _write(self) -> None:
-        """Pass on, in the order of receipt, the messages that had come before the last call.
+        """Pass on the messages that were received before the previous call of this method, in the order of receipt.
 
-        Topics are read one after the other. Until the next call, an older message of another topic may therefore
-        still be read after a newer message.
+        Newer messages wait until the next call. Topics are read one after the other, so an older message of another
+        topic may not have been read yet.
         """
         pictures, reasons = self._devices.take(time.monotonic())
         self._waiting += pictures

@@ -240,7 +240,8 @@ def test_if_an_arm_begins_to_move_while_answers_are_lost_it_begins_from_rest() -
         t, end = max(0.005 * (tick - 4), 0.0), cabinet.now + 0.003
         there = tuple(q + 0.5 * a * t**2 for q in IPO)
         cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (a * t,) * 7, fives))
-        lost = tick <= 10  # The first answers are lost at rest, where their time may jump.
+        # The first answers are lost. As long as the arm rests, the times that the answers are for may jump.
+        lost = tick <= 10
         answer = cabinet.ask(ACTIVE, lost)
         assert answer is not None
         assert answer.q is not None
