@@ -99,7 +99,7 @@ $(VENV)/.installed-web: $(VENV)/.installed
 LEROBOT := .venv-lerobot
 LEROBOT_PYTHON ?= $(shell python3.12 -c '' 2> /dev/null && echo python3.12 || echo $(PYTHON))
 LEROBOT_VERSION ?= <0.7
-LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_teleoperator_q2r2)
+LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_teleoperator_q2r2 q2r2_devices)
 IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python
 
 lerobot: $(LEROBOT)/.installed
@@ -151,7 +151,7 @@ test-learning: $(LEROBOT)/.installed
 $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.toml)
 	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot[feetech]$(LEROBOT_VERSION)' \
 		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # Its loader only needs torch, which is installed.
 	touch $@

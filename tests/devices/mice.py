@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import struct
 import threading
+from collections.abc import Callable
 from typing import Any
 
 FULL = 350  # Reading of an axis at full deflection.
@@ -83,3 +84,9 @@ class Opened:
         (self.read,) = [mouse.read for mouse in self._hid.mice if mouse.info["path"] == path]
 
     def close(self) -> None: ...
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a thread, however long it takes."""
+    while not condition():
+        threading.Event().wait(0.001)

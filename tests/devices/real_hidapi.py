@@ -17,7 +17,7 @@ from q2r2_devices import reading
 from q2r2_devices.spacemouse import MouseSettings, SpaceMouseInput, SpaceMouseSettings
 
 from q2r2_control import HandSample
-from tests.devices.mice import FULL, Mouse, both, buttons, translation
+from tests.devices.mice import FULL, Mouse, both, buttons, translation, until
 
 
 class Terminal:
@@ -66,13 +66,11 @@ def main() -> None:
     wait_for(source, lambda sample: sample.position[0] > 0.04, partial(terminal.send, both(0, -FULL, 0, 0, 0, 0)))
     print("forwards")
     terminal.unplug()
-    while source.connected:
-        time.sleep(0.001)
+    until(lambda: not source.connected)
     assert not source.poll(time.monotonic())
     print("lost")
     terminal = Terminal()
-    while not source.connected:
-        time.sleep(0.001)
+    until(lambda: source.connected)
     engage(source, terminal)
     source.close()
 

@@ -18,8 +18,11 @@ from q2r2_devices import reading
 from q2r2_devices.spacemouse import MouseSettings, Reports
 
 from q2r2_control import Config, ConfigError, InputError, Pipeline, TeleopReason, Tick
+from q2r2_control.config.resources import find_resource
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.inputs import make_input
-from tests.devices.mice import FULL, Hid, Mouse, both, buttons, rotation, translation
+from tests.cli.command import CELL, q2r2
+from tests.devices.mice import FULL, Hid, Mouse, both, buttons, rotation, translation, until
 from tests.support.modules import ROOT
 
 SETTINGS = MouseSettings(speed=0.2, angular_speed=0.8, dead_zone=0.1)
@@ -103,12 +106,6 @@ class Run:
     @property
     def kinds(self) -> list[Any]:
         return [event.reason.kind for tick in self.ticks for event in tick.events]
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for a thread, however long it takes."""
-    while not condition():
-        threading.Event().wait(0.001)
 
 
 def tap(run: Run, mouse: Mouse) -> None:
@@ -243,8 +240,24 @@ def test_a_device_without_permission_ends_the_start_with_the_rule_of_udev(
 def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) -> None:
     with pytest.raises(ConfigError, match=r"^input_settings.spacemouse: no hand; allowed: a hand, as right: \{\}$"):
         make_input("spacemouse", cell("spacemouse"))
-    with pytest.raises(ConfigError, match=r"^input_settings.spacemouse: SpaceMouseSettings: right.speed = 2: allowed: 1 or less$"):
+    with pytest.raises(
+        ConfigError, match=r"^input_settings.spacemouse: SpaceMouseSettings: right.speed = 2: allowed: 1 or less$"
+    ):
         make_input("spacemouse", cell("spacemouse", right={"speed": 2}))
+
+
+def test_the_command_run_finds_the_input_by_its_name_and_ends_with_the_same_line(
+    cell: Cell, plugged: Callable[..., None], tmp_path: Path
+) -> None:
+    plugged()
+    data = read_yaml(find_resource(CELL).read_text(encoding="utf-8"))
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml_of(data | {"input_settings": {"spacemouse": {"left": {}}}}))
+    cell("spacemouse")  # This makes the entry point known.
+    done = q2r2("run", str(file), "--input", "spacemouse", "--plant", "kinematic")
+    assert done.exit_code == 2
+    told = "input_settings.spacemouse.left.device = null: no SpaceMouse is there; connected now: none"
+    assert done.stderr.count(told) == 1
 
 
 def test_without_hidapi_one_line_names_it(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from q2r2_control import HapticFeedback, InputError, Q2R2Error
 
-Reading = TypeVar("Reading")
+Reading = TypeVar("Reading", covariant=True)
 Say = Callable[[str], None]
 tell: Say = logging.getLogger(__name__).info
 
