@@ -35,6 +35,7 @@ class Mouse:
     def __init__(self, path: str, serial: str = "", usage: tuple[int, int] = (1, 8)) -> None:
         self.info = {
             "path": path.encode(),
+            "vendor_id": 0x256F,
             "serial_number": serial,
             "product_string": "SpaceMouse Compact",
             "usage_page": usage[0],

@@ -233,7 +233,8 @@ def test_a_device_without_permission_ends_the_start_with_the_rule_of_udev(
     plugged(Mouse(str(node)))
     monkeypatch.setattr(os, "access", lambda path, mode: path != str(node))  # Root has every permission.
     given = make_input("spacemouse", cell("spacemouse", right={}))
-    with pytest.raises(InputError, match=r'no permission to read .*hidraw3; as root, write KERNEL=="hidraw\*", ATTRS'):
+    rule = r'as root, write KERNEL=="hidraw\*", ATTRS{idVendor}=="256f", TAG'
+    with pytest.raises(InputError, match=rf"no permission to read .*hidraw3; {rule}"):
         given.start()
 
 

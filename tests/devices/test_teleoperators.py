@@ -10,7 +10,9 @@ import pytest
 from q2r2_devices.rate import SILENCE, RateHand, RateReading
 
 from q2r2_control import Config, ConfigError, HandInputs, InputError
+from q2r2_control.config.yaml_text import read_yaml
 from q2r2_control.inputs import adapted, make_input
+from tests.support.modules import blocks_of
 
 Cell = Callable[..., Config]
 GAMEPAD = {"teleoperator": {"type": "gamepad"}}
@@ -72,3 +74,12 @@ def test_a_gap_between_two_polls_moves_the_hand_by_a_tenth_of_a_second_at_most()
     hand.poll([RateReading(FAST, HandInputs())], 0.0)
     (sample,) = hand.poll([RateReading(FAST, HandInputs())], 0.14)
     np.testing.assert_allclose(sample.position, (0.01, 0.0, 0.0), atol=1e-12)
+
+
+def test_the_settings_in_the_docs_are_accepted(cell: Cell) -> None:
+    shown = [block for text in blocks_of("docs/headset.md", "yaml") for block in [read_yaml(text)]]
+    given = {name: its for block in shown for name, its in block.get("input_settings", {}).items()}
+    assert sorted(given) == ["lerobot", "spacemouse"]
+    for name, its in given.items():
+        assert {*its} >= {"left", "right"}
+        make_input(name, cell(name, **its))

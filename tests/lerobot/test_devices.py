@@ -6,6 +6,7 @@ Run by ``make test-lerobot``, in an environment of its own.
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,11 +25,11 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from q2r2_control import Config, ConfigError, HandSample, InputError, Pipeline, load_config
 from q2r2_control.inputs import make_input
 from tests.devices.leader_arm import place, write_urdf
-from tests.devices.mice import until
+from tests.devices.mice import FULL, Hid, Mouse, buttons, translation, until
 from tests.devices.test_pedal import DOWN, KEY_B, UP, events
 from tests.lerobot.servo_bus import ServoBus
 from tests.lerobot.sticks import Sticks
-from tests.lerobot.test_commands import write_cell
+from tests.lerobot.test_commands import CHANGES, write_cell
 
 register_third_party_plugins()
 LINE = "input_settings.lerobot.right: "
@@ -203,3 +204,38 @@ def test_a_leader_drives_the_cell_of_lerobots_robot_only_while_the_pedal_is_held
     finally:
         hands.disconnect()
         robot.disconnect()
+
+
+def test_a_spacemouse_drives_the_cell_of_lerobots_robot_after_a_press(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mouse, rate = Mouse("/dev/hidraw3"), 25.0
+    monkeypatch.setitem(sys.modules, "hidraw", Hid(mouse))
+    file = write_cell(tmp_path, CHANGES | {"input_settings: {}": "input_settings: {spacemouse: {right: {speed: 0.1}}}"})
+    choice = RobotConfig.get_choice_class("q2r2_cell")
+    robot = make_robot_from_config(
+        choice(calibration_dir=tmp_path / "none", cell=str(file), plant="kinematic", simulated_time=True, rate=rate)
+    )
+    choice = TeleoperatorConfig.get_choice_class("q2r2_hands")
+    hands = make_teleoperator_from_config(choice(calibration_dir=tmp_path / "none", input="spacemouse"))
+    watched = Watched(robot.pipeline)
+
+    def send(report: bytes, steps: int) -> None:
+        for _ in range(steps):
+            mouse.send(report)
+            robot.send_action(hands.get_action())
+
+    robot.connect()
+    hands.connect()
+    send(translation(back=-FULL), 10)
+    before = watched.tool
+    send(buttons(), 5)
+    send(translation(), 5)
+    np.testing.assert_allclose(watched.tool, before, atol=1e-4)
+    send(buttons(left=True), 5)
+    send(buttons(), 5)
+    send(translation(back=-FULL), 50)
+    send(translation(), 25)
+    np.testing.assert_allclose(watched.tool - before, (50 / rate * 0.1, 0.0, 0.0), atol=0.005)
+    hands.disconnect()
+    robot.disconnect()

@@ -34,7 +34,6 @@ from q2r2_devices.settings import settings_of
 # HID Usage Tables 1.5, section 4: page and usage of a multi-axis controller.
 _MULTI_AXIS = 0x01, 0x08
 _FULL = 350.0  # Reading of an axis at full deflection, as the device list of pyspacemouse 2.1 has it for all models.
-_UDEV = 'KERNEL=="hidraw*", ATTRS{idVendor}=="256f", TAG+="uaccess"'
 _WORDS = DeviceWords(
     nouns={"lower": "the left button", "upper": "the right button"},
     absent="nothing: a SpaceMouse is not connected",
@@ -116,8 +115,9 @@ class SpaceMouse:
             raise InputError(f"{self._name}.device = {wanted or 'null'}: {problem}; connected now: {there}")
         path = fit[0]["path"].decode()
         if os.path.exists(path) and not os.access(path, os.R_OK | os.W_OK):
-            rule = f"write {_UDEV} to /etc/udev/rules.d/70-spacemouse.rules, and plug the SpaceMouse in again"
-            raise InputError(f"{self._name}: no permission to read {path}; as root, {rule}")
+            rule = f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{fit[0]["vendor_id"]:04x}", TAG+="uaccess"'
+            cure = f"as root, write {rule} to /etc/udev/rules.d/70-spacemouse.rules, and plug the SpaceMouse in again"
+            raise InputError(f"{self._name}: no permission to read {path}; {cure}")
         self._device = hid.device()
         self._device.open_path(fit[0]["path"])
         self._reports = Reports(self._settings)
