@@ -119,7 +119,7 @@ def test_a_button_engages_and_the_cap_moves_the_tool_until_it_is_let_go(
     cell: Cell, plugged: Callable[..., None]
 ) -> None:
     mouse = Mouse("/dev/hidraw3")
-    plugged(mouse)
+    plugged(mouse, Mouse("/dev/hidraw0", usage=(1, 2)))  # The other device is an ordinary mouse.
     run = Run(cell("spacemouse", right={"speed": 0.1}))
     assert run.lines == ["input_settings.spacemouse.right: SpaceMouse Compact at /dev/hidraw3 is connected"]
     forwards = partial(mouse.send, translation(back=-FULL))
@@ -151,10 +151,12 @@ def test_an_unplugged_mouse_stops_the_arms_and_drives_again_after_a_new_press(
     tap(run, mouse)
     run.wait(0.5, partial(mouse.send, translation(down=-FULL)))
     assert run.state == "engaged"
+    mouse.send(translation())
     mouse.plugged = False
     until(lambda: not run.input.connected)
     run.wait(1.0)
     assert run.state == "lost"
+    assert not [sample for tick in run.ticks[-100:] for sample in tick.samples]
     assert run.kinds[-1] is TeleopReason.CONNECTION_LOST
     lost = "input_settings.spacemouse.right: lost, read error; it is opened again as soon as it is there"
     assert run.lines[1:] == [lost]
@@ -187,7 +189,7 @@ def test_a_deflected_mouse_that_falls_silent_stops_its_arm(cell: Cell, plugged: 
 
 def test_each_hand_has_its_own_mouse(cell: Cell, plugged: Callable[..., None]) -> None:
     left, right = Mouse("/dev/hidraw3", serial="A7"), Mouse("/dev/hidraw4", serial="B9")
-    plugged(left, right, Mouse("/dev/hidraw0", usage=(1, 2)))
+    plugged(left, right)
     given = make_input("spacemouse", cell("spacemouse", left={"device": "B9"}, right={"device": "/dev/hidraw3"}))
     given.start()
     left.send(buttons())

@@ -24,10 +24,10 @@ _PER_DEGREE = 4095 / 360.0
 
 
 class ServoBus:
-    """The bus. ``answers`` is False while its servos have no power."""
+    """The bus. ``answers`` is False while its servos have no power. ``has_dropped`` tells that a request got lost."""
 
     def __init__(self) -> None:
-        self.answers = True
+        self.answers, self.has_dropped = True, False
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
@@ -72,6 +72,7 @@ class ServoBus:
             received += os.read(self._master, 1024)
             while len(received) >= 4 and len(received) >= 4 + received[3]:
                 packet, received = received[: 4 + received[3]], received[4 + received[3] :]
+                self.has_dropped = not self.answers
                 if self.answers:
                     self._obey(packet[2], packet[4], packet[5:-1])
 
