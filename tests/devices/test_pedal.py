@@ -64,5 +64,5 @@ def test_a_pedal_without_permission_says_which_group_may_read_it(monkeypatch: py
         raise PermissionError
 
     monkeypatch.setattr(os, "open", refuse)  # Root has every permission.
-    with pytest.raises(InputError, match=r"^pedal: no permission to read /dev/input/event7; sudo usermod -aG input"):
+    with pytest.raises(InputError, match=r"^no permission to read /dev/input/event7; sudo usermod -aG input"):
         Pedal("/dev/input/event7").open()

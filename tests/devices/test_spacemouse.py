@@ -202,17 +202,17 @@ def test_each_hand_has_its_own_mouse(cell: Cell, plugged: Callable[..., None]) -
 @pytest.mark.parametrize(
     ("paths", "settings", "told"),
     [
-        pytest.param((), {"right": {}}, "right.device = null: no SpaceMouse is there; connected now: none", id="none"),
+        pytest.param((), {"right": {}}, "right: device = null: no SpaceMouse is there; connected now: none", id="none"),
         pytest.param(
             ("/dev/hidraw3", "/dev/hidraw4"),
             {"right": {}},
-            "right.device = null: several devices fit; connected now: /dev/hidraw3 or S, /dev/hidraw4 or S",
+            "right: device = null: several devices fit; connected now: /dev/hidraw3 or S, /dev/hidraw4 or S",
             id="two",
         ),
         pytest.param(
             ("/dev/hidraw3",),
             {"left": {"device": "/dev/hidraw3"}, "right": {"device": "B9"}},
-            "right.device = B9: is not there; connected now: /dev/hidraw3 or S",
+            "right: device = B9: is not there; connected now: /dev/hidraw3 or S",
             id="another one",
         ),
     ],
@@ -259,13 +259,15 @@ def test_the_command_run_finds_the_input_by_its_name_and_ends_with_the_same_line
     cell("spacemouse")  # This makes the entry point known.
     done = q2r2("run", str(file), "--input", "spacemouse", "--plant", "kinematic")
     assert done.exit_code == 2
-    told = "input_settings.spacemouse.left.device = null: no SpaceMouse is there; connected now: none"
+    told = "input_settings.spacemouse.left: device = null: no SpaceMouse is there; connected now: none"
     assert done.stderr.count(told) == 1
 
 
 def test_without_hidapi_one_line_names_it(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "hidraw" if sys.platform == "linux" else "hid", None)
-    with pytest.raises(InputError, match=r"^spacemouse: hidapi is not installed; allowed: pip install 'hidapi"):
+    with pytest.raises(
+        InputError, match=r"^input_settings.spacemouse.right: hidapi is not installed; allowed: pip install 'hidapi"
+    ):
         make_input("spacemouse", cell("spacemouse", right={})).start()
 
 

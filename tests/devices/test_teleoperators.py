@@ -20,7 +20,9 @@ GAMEPAD = {"teleoperator": {"type": "gamepad"}}
 
 def test_without_lerobot_one_line_names_the_remedy(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lerobot", None)
-    with pytest.raises(InputError, match=r"^input lerobot: lerobot is not installed; allowed: make lerobot$"):
+    with pytest.raises(
+        InputError, match=r"^input_settings.lerobot.right: lerobot is not installed; allowed: make lerobot$"
+    ):
         make_input("lerobot", cell("lerobot", right=GAMEPAD)).start()
 
 

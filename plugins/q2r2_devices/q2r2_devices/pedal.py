@@ -29,7 +29,7 @@ class Pedal:
             self._file = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK)
         except PermissionError as error:
             cure = "sudo usermod -aG input $USER, and log in again"
-            raise InputError(f"pedal: no permission to read {self._path}; {cure}") from error
+            raise InputError(f"no permission to read {self._path}; {cure}") from error
         self._held: set[int] = set()
         return self._path
 

@@ -23,7 +23,11 @@ _FAILURES = 5
 
 
 class Device(Protocol[Reading]):
-    """A device, or one side of it. Only its own thread calls these methods. Any of them may raise any exception."""
+    """A device. Only its own thread calls these methods, and any of them may raise any exception.
+
+    The line about an exception begins with the reader's name, so the exception's message need not tell which device it
+    is.
+    """
 
     def open(self) -> str:
         """Open the device, and return its name for people."""
@@ -57,8 +61,6 @@ class DeviceReader(Generic[Reading]):
         self._fault, self._thread = None, Thread(target=self._run, name=self._name, daemon=True)
         self._thread.start()
         self._tried.wait()
-        if isinstance(self._fault, Q2R2Error):
-            raise self._fault
         if self._fault is not None:
             raise InputError(f"{self._name}: {_words(self._fault)}") from self._fault
 

@@ -99,8 +99,8 @@ class Reports:
 class SpaceMouse:
     """A SpaceMouse, as a :class:`~q2r2_devices.reading.Device`."""
 
-    def __init__(self, name: str, settings: MouseSettings) -> None:
-        self._name, self._settings = name, settings
+    def __init__(self, settings: MouseSettings) -> None:
+        self._settings = settings
         self._device: Any = None
 
     def open(self) -> str:
@@ -112,12 +112,12 @@ class SpaceMouse:
         if len(fit) != 1:
             there = ", ".join(" or ".join(_names(info)) for info in found.values()) or "none"
             problem = "several devices fit" if fit else "is not there" if wanted else "no SpaceMouse is there"
-            raise InputError(f"{self._name}.device = {wanted or 'null'}: {problem}; connected now: {there}")
+            raise InputError(f"device = {wanted or 'null'}: {problem}; connected now: {there}")
         path = fit[0]["path"].decode()
         if os.path.exists(path) and not os.access(path, os.R_OK | os.W_OK):
             rule = f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{fit[0]["vendor_id"]:04x}", TAG+="uaccess"'
             cure = f"as root, write {rule} to /etc/udev/rules.d/70-spacemouse.rules, and plug the SpaceMouse in again"
-            raise InputError(f"{self._name}: no permission to read {path}; {cure}")
+            raise InputError(f"no permission to read {path}; {cure}")
         self._device = hid.device()
         self._device.open_path(fit[0]["path"])
         self._reports = Reports(self._settings)
@@ -147,7 +147,7 @@ def _hidapi() -> Any:
         else:
             import hid
     except ImportError as error:
-        raise InputError("spacemouse: hidapi is not installed; allowed: pip install 'hidapi>=0.14,<0.16'") from error
+        raise InputError("hidapi is not installed; allowed: pip install 'hidapi>=0.14,<0.16'") from error
     return hid
 
 
@@ -158,11 +158,12 @@ class SpaceMouseInput(DeviceInput):
 
     def __init__(self, settings: SpaceMouseSettings, say: Say = tell) -> None:
         mice = {"left": settings.left, "right": settings.right}
-        named = {hand: (f"input_settings.spacemouse.{hand}", its) for hand, its in mice.items() if its is not None}
-        if not named:
+        given = {hand: its for hand, its in mice.items() if its is not None}
+        if not given:
             raise ConfigError("input_settings.spacemouse: no hand; allowed: a hand, as right: {}")
-        super().__init__({hand: DeviceReader(name, SpaceMouse(name, its), say) for hand, (name, its) in named.items()})
-        self._hands = {hand: RateHand(hand) for hand in named}
+        where = "input_settings.spacemouse"
+        super().__init__({hand: DeviceReader(f"{where}.{hand}", SpaceMouse(its), say) for hand, its in given.items()})
+        self._hands = {hand: RateHand(hand) for hand in given}
 
     @classmethod
     def from_config(cls, config: Config, say: Say = tell) -> SpaceMouseInput:

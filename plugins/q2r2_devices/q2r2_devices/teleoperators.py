@@ -95,8 +95,8 @@ class Teleoperator:
         self._device = _made(self._settings.teleoperator)
         if not self._has_pedal and not hasattr(self._device, "get_teleop_events"):
             raise ConfigError(
-                f"{_WHERE}.pedal: missing, and {self._device.name} has no switch that engages an arm; "
-                "allowed: an event device such as /dev/input/by-id/usb-...-event-kbd"
+                f"{self._device.name} has no switch that engages an arm; "
+                f"allowed: {_WHERE}.pedal, an event device such as /dev/input/by-id/usb-...-event-kbd"
             )
         names = list(self._device.action_features.get("names", self._device.action_features))
         if self._settings.leader is not None:
@@ -140,7 +140,7 @@ def _made(settings: dict[str, Any]) -> Any:
         import lerobot.teleoperators as known
         from lerobot.utils.import_utils import register_third_party_plugins
     except ImportError as error:
-        raise InputError("input lerobot: lerobot is not installed; allowed: make lerobot") from error
+        raise InputError("lerobot is not installed; allowed: make lerobot") from error
     # A type is known after its module was imported. The modules whose own packages are missing are left out.
     for module in pkgutil.iter_modules(known.__path__, f"{known.__name__}."):
         with suppress(Exception):
