@@ -62,6 +62,9 @@ class Foot:
     def release(self) -> None:
         os.write(self._file, events((KEY_B, UP)))
 
+    def unplug(self) -> None:
+        os.close(self._file)
+
 
 def settings(folder: Path, bus: ServoBus, pedal: str | None, calibrated: bool = True) -> dict[str, Any]:
     if calibrated:
@@ -102,6 +105,11 @@ def test_a_leader_arm_gives_the_pose_of_its_tool_its_gripper_and_the_pedal(tmp_p
     moved = polled(source, lambda sample: abs(sample.position[2] - wanted[2]) < 1e-3)
     np.testing.assert_allclose(moved.position, wanted, atol=1e-3)
     foot.release()
+    polled(source, lambda sample: sample.inputs.press_middle == 0.0)
+    foot.press()
+    polled(source, lambda sample: sample.inputs.press_middle == 1.0)
+    foot.unplug()
+    until(lambda: not source.connected)
     polled(source, lambda sample: sample.inputs.press_middle == 0.0)
     source.close()
 
