@@ -102,7 +102,7 @@ $(VENV)/.installed-web: $(VENV)/.installed
 LEROBOT := .venv-lerobot
 LEROBOT_PYTHON ?= $(shell python3.12 -c '' 2> /dev/null && echo python3.12 || echo $(PYTHON))
 LEROBOT_VERSION ?= <0.7
-LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_teleoperator_q2r2)
+LEROBOT_PLUGINS := $(addprefix --editable plugins/,lerobot_robot_q2r2 lerobot_teleoperator_q2r2 q2r2_devices)
 IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/python
 
 lerobot: $(LEROBOT)/.installed

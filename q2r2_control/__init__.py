@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.device_words import DeviceWords as DeviceWords
     from q2r2_control.errors import CameraError as CameraError
     from q2r2_control.errors import ConfigError as ConfigError
+    from q2r2_control.errors import InputError as InputError
     from q2r2_control.errors import PlantError as PlantError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
     from q2r2_control.errors import RecordingError as RecordingError
@@ -93,6 +94,7 @@ _MODULES = {
     "HandSample": "types",
     "HapticFeedback": "types",
     "Input": "inputs.base",
+    "InputError": "errors",
     "JointTarget": "control.tasks.named_tasks",
     "LookAt": "control.tasks.named_tasks",
     "MovingObstacle": "config.moving_obstacle",

@@ -182,6 +182,9 @@ class Config(StrictModel):
         AUTO, description="control loop [Hz]; auto: the highest of 1000, 500 and 250 that this computer can keep"
     )
     input: str = Field("scripted", min_length=1, description="input device, if no --input is given")
+    input_settings: dict[str, dict[str, Any]] = Field(
+        {}, description="settings of inputs of other packages, by their entry point's name; each checks its own"
+    )
     plant: str = Field("mujoco", min_length=1, description="plant, if no --plant is given")
     plant_settings: dict[str, dict[str, Any]] = Field(
         {}, description="settings of plants of other packages, by their entry point's name; each checks its own"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 
@@ -16,6 +17,15 @@ def install(folder: Path, package: str, source: str, entries: str) -> None:
     (folder / f"{package}.py").write_text(source)
     (folder / f"{package}-1.0.dist-info").mkdir()
     (folder / f"{package}-1.0.dist-info/entry_points.txt").write_text(entries)
+
+
+def entry_points_of(plugin: str) -> str:
+    """Return the entry points in the pyproject.toml of a folder in ``plugins``, as an installed package has them."""
+    about = tomllib.loads((ROOT / "plugins" / plugin / "pyproject.toml").read_text(encoding="utf-8"))
+    lines: list[str] = []
+    for group, entries in about["project"]["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {at}" for name, at in entries.items())]
+    return "\n".join(lines)
 
 
 def blocks_of(page: str, language: str) -> list[str]:

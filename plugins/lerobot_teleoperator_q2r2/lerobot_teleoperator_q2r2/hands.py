@@ -72,8 +72,9 @@ class Q2R2Hands(Teleoperator):
         with ExitStack() as attached:
             door.operator = hands
             attached.callback(setattr, door, "operator", None)
+            if (cell := adapted(self.config.input, pipeline.config)) is not pipeline.config:
+                pipeline.change_teleop(cell.teleop)
             if isinstance(hands, WebInput):
-                pipeline.change_teleop(adapted(self.config.input, pipeline.config).teleop)
                 page = attached.enter_context(PageView(self.config.web_host, self.config.web_port))
                 page.begin(pipeline, self.name, recorded=False)
                 for line in page.lines:

@@ -1,0 +1,79 @@
+"""Read reports through the real hidapi, from a pseudo-terminal in place of /dev/hidraw. Prints what the hand does.
+
+No computer of the tests has a SpaceMouse, and their kernels cannot simulate one. Only the list of devices is replaced.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import time
+import tty
+from collections.abc import Callable
+from functools import partial
+
+import hidraw
+from q2r2_devices import reading
+from q2r2_devices.spacemouse import MouseSettings, SpaceMouseInput, SpaceMouseSettings
+
+from q2r2_control import HandSample
+from tests.devices.mice import FULL, Mouse, both, buttons, translation, until
+
+
+class Terminal:
+    """A terminal that hidapi lists as a SpaceMouse."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        hidraw.enumerate = lambda: [Mouse(self.path).info]
+
+    def send(self, report: bytes) -> None:
+        os.write(self.master, report)
+
+    def unplug(self) -> None:
+        os.close(self._slave)
+        os.close(self.master)
+
+
+def wait_for(
+    source: SpaceMouseInput, fits: Callable[[HandSample], bool], act: Callable[[], None] = lambda: None
+) -> None:
+    """Poll until a sample fits. Before each poll, ``act``."""
+    while True:
+        act()
+        time.sleep(0.02)  # A terminal has no borders of reports, so the reader has to take one before the next.
+        if any(map(fits, source.poll(time.monotonic()))):
+            return
+
+
+def engage(source: SpaceMouseInput, terminal: Terminal) -> None:
+    terminal.send(buttons(left=True))
+    wait_for(source, lambda sample: sample.inputs.button_lower)
+    terminal.send(buttons())
+    wait_for(source, lambda sample: not sample.inputs.button_lower)
+    print("engages")
+
+
+def main() -> None:
+    reading._RETRY = 0.01
+    terminal = Terminal()
+    source = SpaceMouseInput(SpaceMouseSettings(right=MouseSettings()))
+    source.start()
+    engage(source, terminal)
+    wait_for(source, lambda sample: sample.position[0] > 0.02, partial(terminal.send, translation(back=-FULL)))
+    wait_for(source, lambda sample: sample.position[0] > 0.04, partial(terminal.send, both(0, -FULL, 0, 0, 0, 0)))
+    print("forwards")
+    terminal.unplug()
+    until(lambda: not source.connected)
+    assert not source.poll(time.monotonic())
+    print("lost")
+    terminal = Terminal()
+    until(lambda: source.connected)
+    engage(source, terminal)
+    source.close()
+
+
+if __name__ == "__main__":
+    main()

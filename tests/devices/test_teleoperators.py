@@ -1,0 +1,87 @@
+"""The hands of teleoperators and of rate devices, without lerobot. tests/lerobot/test_devices.py has the rest."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from q2r2_devices.rate import SILENCE, RateHand, RateReading
+
+from q2r2_control import Config, ConfigError, HandInputs, InputError
+from q2r2_control.config.yaml_text import read_yaml
+from q2r2_control.inputs import adapted, make_input
+from tests.support.modules import blocks_of
+
+Cell = Callable[..., Config]
+GAMEPAD = {"teleoperator": {"type": "gamepad"}}
+
+
+def test_without_lerobot_one_line_names_the_remedy(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lerobot", None)
+    with pytest.raises(
+        InputError, match=r"^input_settings.lerobot.right: lerobot is not installed; allowed: make lerobot$"
+    ):
+        make_input("lerobot", cell("lerobot", right=GAMEPAD)).start()
+
+
+def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) -> None:
+    with pytest.raises(ConfigError, match=r"^input_settings.lerobot: no hand; allowed: a hand, as right: {teleop"):
+        make_input("lerobot", cell("lerobot", pedal="/dev/input/event7"))
+    with pytest.raises(ConfigError, match=r"right.teleoperator: missing"):
+        make_input("lerobot", cell("lerobot", right={}))
+
+
+def test_the_switch_is_a_dead_mans_switch_whatever_the_cell_binds(cell: Cell) -> None:
+    bindings = adapted("lerobot", cell("lerobot", right=GAMEPAD)).teleop.bindings
+    assert {binding.control: binding.action for binding in bindings.bound()} == {
+        "trigger": "gripper_analog",
+        "grip": "dead_man",
+    }
+
+
+FAST = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.5])
+
+
+def test_a_rate_hand_integrates_its_velocity_in_axes_that_do_not_turn_with_it() -> None:
+    hand = RateHand("left")
+    for step in range(101):
+        samples = hand.poll([RateReading(FAST, HandInputs())], 0.02 * step)
+    np.testing.assert_allclose(samples[-1].position, (0.2, 0.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(samples[-1].quaternion, (0.0, 0.0, np.sin(0.5), np.cos(0.5)), atol=1e-12)
+
+
+def test_a_deflected_hand_without_readings_stops_and_has_no_samples_and_a_hand_at_rest_has() -> None:
+    hand = RateHand("left")
+    hand.poll([RateReading(FAST, HandInputs())], 0.0)
+    hand.poll([], SILENCE / 2.0)
+    assert hand.poll([], SILENCE - 0.01)
+    assert not hand.poll([], SILENCE + 0.01)
+    assert not hand.poll([], 10.0)
+    (after,) = hand.poll([RateReading(np.zeros(6), HandInputs())], 10.01)
+    np.testing.assert_allclose(after.position, (0.1 * (SILENCE - 0.01), 0.0, 0.0), atol=1e-12)
+    assert hand.poll([], 20.0)
+
+
+def test_a_tap_that_is_shorter_than_the_period_of_the_samples_is_not_lost() -> None:
+    hand = RateHand("left")
+    hand.poll([RateReading(np.zeros(6), HandInputs())], 0.0)
+    pressed, released = (RateReading(np.zeros(6), HandInputs(button_lower=held)) for held in (True, False))
+    assert [sample.inputs.button_lower for sample in hand.poll([pressed, released], 0.001)] == [True, False]
+
+
+def test_a_gap_between_two_polls_moves_the_hand_by_a_tenth_of_a_second_at_most() -> None:
+    hand = RateHand("left")
+    hand.poll([RateReading(FAST, HandInputs())], 0.0)
+    (sample,) = hand.poll([RateReading(FAST, HandInputs())], 0.14)
+    np.testing.assert_allclose(sample.position, (0.01, 0.0, 0.0), atol=1e-12)
+
+
+def test_the_settings_in_the_docs_are_accepted(cell: Cell) -> None:
+    shown = [block for text in blocks_of("docs/headset.md", "yaml") for block in [read_yaml(text)]]
+    given = {name: its for block in shown for name, its in block.get("input_settings", {}).items()}
+    assert sorted(given) == ["lerobot", "spacemouse"]
+    for name, its in given.items():
+        assert {*its} >= {"left", "right"}
+        make_input(name, cell(name, **its))
