@@ -154,7 +154,7 @@ test-learning: $(LEROBOT)/.installed
 $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.toml)
 	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[sim,fri,export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[sim,fri,export,lerobot]' 'lerobot[feetech]$(LEROBOT_VERSION)' \
 		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # Its loader only needs torch, which is installed.
 	touch $@
