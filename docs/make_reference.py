@@ -13,9 +13,10 @@ FILE = Path(__file__).with_name("configuration.md")
 _HEAD = """\
 # Configuration
 
-Every key of a cell's YAML, with its default and what is allowed. A key without a default is required.
-`q2r2 check CELL.yaml` checks a file, and names key, value and what is allowed where something is wrong.
-[`config/dual_iiwa7.yaml`](../config/dual_iiwa7.yaml) shows all keys in use. Made by `python docs/make_reference.py`.
+This page lists every key of a cell's YAML, with its default and the allowed values. A key without a default is
+required. `q2r2 check CELL.yaml` checks a file. For each fault, it names the key, the value and what is allowed.
+[`config/dual_iiwa7.yaml`](../config/dual_iiwa7.yaml) contains every key. This page is written by
+`python docs/make_reference.py`.
 """
 _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
 
