@@ -94,6 +94,7 @@ class Operator(ScriptedInput):
         end = self._ends[self.report.sessions % len(self._ends)]
         self.report.sessions += 1
         self.report.ends[end] += 1
+        print(f"session {self.report.sessions} of {self._sessions}: {end}", file=sys.stderr)
         self._end(end, self._arms[self._random.choice(SIDES)])
 
     def _end(self, how: str, arm: SimulatedArm) -> None:
@@ -189,8 +190,8 @@ def run_slowly(*arguments: str, slowness: float) -> dict[str, object]:
     path = os.pathsep.join([clock, *(os.path.abspath(folder) for folder in sys.path)])
     environment = os.environ | {"PYTHONPATH": path, "SLOWNESS": str(slowness)}
     command = [sys.executable, "-m", __name__ if __name__ != "__main__" else "tests.franka.soak", *arguments, "--json"]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-4000:]
+    done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0, f"exit code {done.returncode}; standard error has the reason"
     found: dict[str, object] = json.loads(done.stdout.splitlines()[-1])
     return found
 
