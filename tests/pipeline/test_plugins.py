@@ -166,9 +166,10 @@ def test_the_plant_in_docs_extending_reports_a_fault_that_its_command_finds_in_t
 def test_a_wrong_setting_of_the_plant_in_docs_extending_is_named_by_check_and_run(
     file: Path, settings: dict[str, float], told: str
 ) -> None:
-    cell = str(changed(file, {"plant": "thermal", "plant_settings": {"thermal": settings}}))
-    for command in ("check", "run"):
-        refused = q2r2(command, cell)
+    """The command check also checks the blocks of plants that are not the cell's."""
+    cell = str(changed(file, {"plant": "lagging", "plant_settings": {"thermal": settings}}))
+    for arguments in (("check", cell), ("run", cell, "--plant", "thermal")):
+        refused = q2r2(*arguments)
         assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
         assert told in refused.stderr
 
