@@ -184,7 +184,11 @@ class WaitingPlant(Protocol):
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
-    """Return the plant with the name ``plant``, or ``plant`` itself; raises :class:`ConfigError` for another name."""
+    """Return the plant with the name ``plant``, or ``plant`` itself.
+
+    Raises:
+        ConfigError: If no plant has this name, or if a value in its block of ``plant_settings`` is not allowed.
+    """
     if not isinstance(plant, str):
         check_kind("plant", plant, Plant, "the name of a plant, or an object with all methods of Plant")
         return plant
