@@ -71,6 +71,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.types import Reference as Reference
     from q2r2_control.types import RobotState as RobotState
     from q2r2_control.types import StepReport as StepReport
+    from q2r2_control.wording import sentence as sentence
 
 _MODULES = {
     "ActionSpace": "inputs.policy",
@@ -131,6 +132,7 @@ _MODULES = {
     "action_names": "inputs.policy",
     "load_commissioned": "robot.commissioned",
     "load_config": "config.cell_file",
+    "sentence": "wording",
 }
 __all__ = list(_MODULES)
 __getattr__, __dir__ = lazy_exports(__name__, _MODULES)

@@ -53,9 +53,14 @@ def _kinds() -> dict[str, ReasonKind]:
     return {str(kind): kind for enum in enums for kind in enum}
 
 
+def is_kind(value: str) -> bool:
+    """Return whether this package, or another installed package, has a kind with this value."""
+    return value in _kinds()
+
+
 def kind_named(value: str) -> ReasonKind:
     """Return the kind with this value, from any subpackage. Raises :class:`ValueError` if no kind has the value."""
-    if value not in _kinds():
+    if not is_kind(value):
         raise ValueError(f"no room has the kind of reason {value!r:.60}")
     return _kinds()[value]
 
@@ -96,7 +101,7 @@ class Reason:
         """Make the reason from the data of :meth:`as_json`.
 
         Raises:
-            ValueError, KeyError, TypeError: For other data.
+            ValueError, KeyError, TypeError: For other data, and for a kind that no installed package has.
         """
         cause = cls.from_json(data["cause"]) if "cause" in data else None
         return cls(kind_named(data["kind"]), dict(data.get("detail", {})), cause)
@@ -126,6 +131,6 @@ class Event:
         """Make the event from the data of :meth:`as_json`.
 
         Raises:
-            ValueError, KeyError, TypeError: For other data.
+            ValueError, KeyError, TypeError: For other data, and for a kind that no installed package has.
         """
         return cls(float(data["t"]), data["arm"], data["from"], data["to"], Reason.from_json(data))

@@ -48,19 +48,18 @@ def test_no_two_subpackages_have_kinds_of_reasons_with_the_same_value() -> None:
 
 
 def test_the_example_reason_of_extending_md_is_restored_from_json_and_gives_its_sentence(tmp_path: Path) -> None:
-    (source,) = [block for block in blocks_of("docs/extending.md", "python") if "DriveReason" in block]
-    install(tmp_path, "my_drives", source, "[q2r2_control.reasons]\ndrives = my_drives:DriveReason\n")
-    recorded = {"kind": "drive_too_hot", "detail": {"joint": "A4", "celsius": 81.2}}
+    (source,) = [block for block in blocks_of("docs/extending.md", "python") if "class DriveReason" in block]
+    install(tmp_path, "my_package", source, "[q2r2_control.reasons]\ndrives = my_package:DriveReason\n")
+    recorded = {"kind": "drive_too_hot", "detail": {"joint": "A4", "allowed": 81.2}}
     code = f"""
-from q2r2_control import Reason
-from q2r2_control.wording import sentence
+from q2r2_control import Reason, sentence
 reason = Reason.from_json({recorded})
 assert reason.as_json() == {recorded}
 print(sentence(reason))
 """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}
     said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert said.stdout == "the drive of A4 has 81 degrees\n", said.stderr
+    assert said.stdout == "the drive of A4 is hotter than 81.2 degrees\n", said.stderr
 
 
 def test_the_sentence_of_a_reason_contains_its_numbers_and_its_cause() -> None:

@@ -30,7 +30,15 @@ from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.requests import RequestedRun
 from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.pipeline.target_lead import TargetLead
-from q2r2_control.plants.base import Plant, SessionPlant, check_mode, check_state, keeps_jerk_limit, make_plant
+from q2r2_control.plants.base import (
+    FaultReportingPlant,
+    Plant,
+    SessionPlant,
+    check_mode,
+    check_state,
+    keeps_jerk_limit,
+    make_plant,
+)
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turns import TurnCounter
@@ -245,7 +253,7 @@ class Pipeline(RequestedRun):
     def check(self) -> None:
         """Raise :class:`PlantError` if supervision has stopped the arms."""
         phase = self.supervisor.phase
-        if phase is Phase.STOPPED or (phase is not Phase.ACTIVE and self._sessions is None):
+        if phase is Phase.STOPPED or (phase is not Phase.ACTIVE and self._reporting is None):
             fault = self.supervisor.fault
             raise PlantError("the arms were stopped" if fault is None else sentence(fault))
 
@@ -343,7 +351,8 @@ class Pipeline(RequestedRun):
         self._plant_clock = PlantClock(self._state)
         self._lead = TargetLead()
         self._watch_skew(self._clock.now)
-        if sessions is None or sessions.fault() is None:
+        reporting = self._reporting = self.plant if isinstance(self.plant, FaultReportingPlant) else None
+        if reporting is None or reporting.fault() is None:
             self.loop.activate(self._state, self._clock.now)
             self.supervisor.events.clear()
         else:
@@ -379,7 +388,7 @@ class Pipeline(RequestedRun):
                 self._bring_to_rest()
             raise
         self._bring_to_rest()
-        if self._sessions is None and (fault := self.supervisor.state_fault):
+        if self._reporting is None and (fault := self.supervisor.state_fault):
             raise PlantError(sentence(fault))
         return self._recorder.finish(self._clock, self.loop.pacer)
 
@@ -415,7 +424,7 @@ class Pipeline(RequestedRun):
         seen, passed = self._plant_clock.stamped(given, now)
         seen = self._turns.of_state(seen)
         state = self._state = replace(seen, stamp=given.stamp)
-        lost = None if self._sessions is None else self._sessions.fault()
+        lost = None if self._reporting is None else self._reporting.fault()
         self.loop.observe(seen, now, passed, lost)
         self._watch_skew(now)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)

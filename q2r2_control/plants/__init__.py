@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from q2r2_control.plants.base import FaultReportingPlant as FaultReportingPlant
     from q2r2_control.plants.base import RealPlant as RealPlant
     from q2r2_control.plants.base import SessionPlant as SessionPlant
     from q2r2_control.plants.base import WaitingPlant as WaitingPlant
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "ArmTiming": ".types",
     "CellPictures": "mujoco_cameras",
+    "FaultReportingPlant": "base",
     "FriReason": "fri.reasons",
     "MujocoPlant": "mujoco",
     "ReferencePath": "fri.answers",

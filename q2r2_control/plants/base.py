@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -35,9 +35,10 @@ class Plant(Protocol):
     time of the tick pass, and ``state`` returns the measurement. The time of real hardware passes by itself, so that
     ``advance`` of such a plant waits for the next measurement. A new plant stands at home with open grippers until a
     command comes. A plant with a window is a :class:`WindowedPlant`. A plant that is found by its name also has a class
-    method ``from_config(robot, config)``. Its class may have these further attributes:
+    method ``from_config(robot, config)``, in which ``config`` is the cell. Its class may have these further attributes:
 
-    - ``settings``: The :class:`StrictModel` of its block in ``plant_settings``. ``q2r2 check`` checks the block by it.
+    - ``settings``: The :class:`StrictModel` of its block in ``plant_settings``. The block is checked by it before
+      ``from_config`` is called, and by ``q2r2 check``.
     - ``simulated``: True if its time is that of ``advance``. A run with scripted hands is then in simulated time.
     - ``realtime_only``: True if the plant's time passes by itself. Simulated time and replays are then refused.
     """
@@ -105,14 +106,33 @@ class PicturedPlant(Protocol):
 
 
 @runtime_checkable
-class SessionPlant(Protocol):
-    """The additional methods of a plant whose arms follow commands only during sessions, each arm with its own timing.
+class FaultReportingPlant(Protocol):
+    """The additional method of a plant that can report a fault, for example a motor that is too hot.
 
-    The arms start where they stand. If the session of one arm ends, all arms brake, but the run goes on. The arms are
-    activated again in the postures in which they rest, as soon as all of them are in a session again.
+    While the plant reports a fault, its arms are measured, but do not follow the operator. All arms brake along the
+    certified stop, which the plant still has to follow, and the run goes on. When the fault is over and the arms rest,
+    they are activated where they are. Each arm then waits for a new press of its operator. A plant without this method
+    reports a fault by a :class:`PlantError`, which ends the run.
     """
 
-    realtime_only: bool
+    def fault(self) -> Reason | None:
+        """Return why the arms must not follow now, or must not have followed at some time since the last call.
+
+        The method is called at each tick, after ``state``, and returns None if there is no fault. While a fault lasts,
+        each call should return an equal reason. If a run begins during a fault, each other reason is a line in the log.
+        """
+
+
+@runtime_checkable
+class SessionPlant(FaultReportingPlant, Protocol):
+    """The additional methods of a plant whose arms follow only during sessions, each arm with its own timing.
+
+    The arms start where they stand. If the session of one arm ends, ``fault`` returns why, and all arms brake. They are
+    activated again where they rest, as soon as all of them are in a session again. A simulation, or a driver whose arms
+    follow every command at once, needs no sessions. It is a :class:`FaultReportingPlant`, or only a :class:`Plant`.
+    """
+
+    realtime_only: bool  # True if the plant's time passes by itself, as it does for each real robot.
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
         """Prepare for commands of ``mode``, which come after the next ``reset``.
@@ -123,35 +143,38 @@ class SessionPlant(Protocol):
     def due(self, now: float) -> tuple[float, float]:
         """Return the durations of two motions in the tick at ``now`` [s]: a certified stop, and a new motion [s].
 
-        If a command was late, the arms have already begun the certified stop. The reference then follows this stop for
-        the first duration; otherwise the first duration is 0. The new motion follows. The tick's command is the state
-        of the reference at the end of the new motion.
+        If a command was late, the plant already follows the certified stop, and the first duration says for how long;
+        otherwise it is 0. The reference advances by both durations, and the tick's command is for their end. A plant in
+        which no command can be late returns 0, and the time since the last call.
         """
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it.
+
+        A plant in which no command can be late returns False.
+        """
 
     def delay(self) -> float:
-        """Return the time from the moment when a command is due until the arms are measured at its posture [s]."""
+        """Return the time from the moment when a command is due until the arms are measured at its posture [s].
+
+        Targets of tools are moved ahead by this time, so that the arms do not lag behind the hands. 0 moves no target.
+        """
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return how the motion of each arm is timed relative to the reference; empty if all arms have one timing."""
+        """Return how the motion of each arm is timed relative to the reference, by the names of the arms.
+
+        The result is empty if all arms have the same timing.
+        """
 
     def lead(self) -> float:
         """Return the longest time from the newest posture that was sent to an arm to the end of the newest step [s].
 
-        Both are times of the reference. They differ because the loop computes the reference some time before the plant
-        sends its postures to the arms.
-        """
-
-    def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded now, or why they could not at some time since the last call.
-
-        The result is None if the arms could always be commanded.
+        A command is for the end of its tick. Some plants send the arms an earlier posture on the way to it. The result
+        is the time from this posture to the end of the tick. A plant that sends each command at once returns 0.
         """
 
     def sessions(self) -> dict[str, str]:
-        """Return the state of each arm's session in words."""
+        """Return the state of each arm's session in words, by the names of the arms. It may be empty."""
 
 
 @runtime_checkable
@@ -173,11 +196,17 @@ class WaitingPlant(Protocol):
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
-    """Return the plant with the name ``plant``, or ``plant`` itself; raises :class:`ConfigError` for another name."""
+    """Return the plant with the name ``plant``, or ``plant`` itself.
+
+    Raises:
+        ConfigError: If no plant has this name, or if a value in its block of ``plant_settings`` is not allowed.
+    """
     if not isinstance(plant, str):
         check_kind("plant", plant, Plant, "the name of a plant, or an object with all methods of Plant")
         return plant
-    made: Plant = load_class(PLANTS, plant).from_config(robot, config)
+    found = load_class(PLANTS, plant)
+    _check_block(plant, found, config)
+    made: Plant = found.from_config(robot, config)
     return made
 
 
@@ -191,13 +220,19 @@ def check_plant_settings(config: Config) -> list[str]:
         ConfigError: If a value is not allowed. The message names the key.
     """
     unknown = []
-    for name, block in config.plant_settings.items():
+    for name in config.plant_settings:
         if name not in names_of(PLANTS):
             installed = ", ".join(names_of(PLANTS))
             unknown.append(f"plant_settings.{name}: no installed plant has this name; installed: {installed}")
-        elif (model := getattr(load_class(PLANTS, name), "settings", None)) is not None:
-            validated(model, f"plant_settings.{name}: ", block)
+        else:
+            _check_block(name, load_class(PLANTS, name), config)
     return unknown
+
+
+def _check_block(name: str, plant: Any, config: Config) -> None:
+    """Check the block of a class of plants in ``plant_settings``; raises :class:`ConfigError` as its caller does."""
+    if name in config.plant_settings and (model := getattr(plant, "settings", None)) is not None:
+        validated(model, f"plant_settings.{name}: ", config.plant_settings[name])
 
 
 def is_mujoco(plant: object) -> TypeIs[MujocoPlant]:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from q2r2_control.recording.reader import recordings_in as recordings_in
     from q2r2_control.recording.recorder import Recorder as Recorder
     from q2r2_control.recording.recorder import RecordingSummary as RecordingSummary
+    from q2r2_control.recording.ros_recording import events_of as events_of
 
 require("data", "work with recordings")
 
@@ -21,6 +22,7 @@ _MODULES = {
     "DevicePictures": "device_pictures",
     "Recorder": "recorder",
     "RecordingSummary": "recorder",
+    "events_of": "ros_recording",
     "recordings_in": "reader",
 }
 __all__ = list(_MODULES)

@@ -36,6 +36,7 @@ from q2r2_control.recording.messages import (
     picture_topic,
     unit_of_depth,
 )
+from q2r2_control.recording.recorded_reasons import event_of
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
 from q2r2_control.teleop.reasons import TeleopReason
 
@@ -298,8 +299,13 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:
     """Return the episodes of a recording. Raises :class:`RecordingError` if it is damaged."""
+    return spans_of(read_events(recording), recording.conclusion.success)
+
+
+def read_events(recording: Recording) -> list[Event]:
+    """Return all events of a recording. Raises :class:`RecordingError` if it is damaged."""
     try:
-        return spans_of(_events_of(recording), recording.conclusion.success)
+        return list(_events_of(recording))
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{recording.file}: damaged: {error!r:.200}") from error
 
@@ -312,7 +318,7 @@ def _events_of(recording: Recording) -> Iterator[Event]:
     if recording.about.source == LOOP:
         states = (str(data_of(one.payload, TEXT)) for messages in recording.messages({STATE}) for one in messages)
         for state in states:
-            yield from map(Event.from_json, json.loads(state).get("events", ()))
+            yield from map(event_of, json.loads(state).get("events", ()))
         return
     for chunk in recording.chunks():
         for events in chunk.events().values():

@@ -14,6 +14,7 @@ from q2r2_control.config.cell_file import parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event
 from q2r2_control.recording.reader import NO_END, Recording
+from q2r2_control.recording.recorded_reasons import chunk_of
 from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import HAND_FAULTS, NOT_MEASURED, SAMPLE_FIELDS, PackedTick
 from q2r2_control.recording.writer import RecordedRobot
@@ -100,7 +101,7 @@ class RecordedTicks:
                 following=bool(row["following"]),
                 connected=bool(row["connected"]),
                 samples=list(map(_sample, samples, more)),
-                chunks=[ActionChunk.from_json(data) for data in text.get("chunks", [])],
+                chunks=[chunk_of(data) for data in text.get("chunks", [])],
                 state=RobotState(
                     row["q"].copy(), row["v"].copy(), row["tau"].copy(), external, float(row["state_stamp"])
                 ),

@@ -24,7 +24,8 @@ from q2r2_control.events import Event
 from q2r2_control.recording import messages as names
 from q2r2_control.recording.about import ROS
 from q2r2_control.recording.messages import NANOSECONDS, STORE, Message, pose_of
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import Recording, read_events
+from q2r2_control.recording.recorded_reasons import event_of
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of, tool_poses
 from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
@@ -41,6 +42,23 @@ def open_recording(path: Path) -> Recording:
     """Open a recording of a loop or of the ROS nodes. Raises :class:`RecordingError`, see :class:`Recording`."""
     recording = Recording(path)
     return RosRecording(path) if recording.about.source == ROS else recording
+
+
+def events_of(path: Path) -> list[Event]:
+    """Return all events of a recording, in the order of time.
+
+    Args:
+        path: The file, or a folder in which it is the only recording.
+
+    Returns:
+        The changes of the arms' states with their reasons, and the operator's marks. Times are since the run began [s].
+        A kind of reason that no installed package has is read as :attr:`CommonReason.OTHER`, with its name as the text.
+
+    Raises:
+        RecordingError: If the file is no recording or is damaged, or if ROS nodes recorded the arms of another
+            controller than the built-in one.
+    """
+    return read_events(open_recording(path))
 
 
 class RosRecording(Recording):
@@ -179,7 +197,7 @@ class RosTicks:
     def _on_event(self, message: Any, time: int) -> None:
         # The time of receipt replaces the sender's time, because the sender has another clock.
         told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}
-        self._events.append(Event.from_json(told))
+        self._events.append(event_of(told))
 
     def _on_hand(self, side: int, message: Any, time: int) -> None:
         sample = np.zeros(len(SAMPLE_FIELDS))

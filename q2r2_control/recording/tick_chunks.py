@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from q2r2_control.events import Event
 from q2r2_control.recording.messages import SAMPLES, STATE, TEXT, TICK, Message, data_of, numbers_of
+from q2r2_control.recording.recorded_reasons import event_of
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.types import Array
 
@@ -38,7 +39,7 @@ class TickChunk:
         Raises ValueError, KeyError and TypeError if a state is not JSON or has other fields.
         """
         found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
-        return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
+        return {number: [event_of(event) for event in events] for number, events in found.items()}
 
 
 class TickAssembly:

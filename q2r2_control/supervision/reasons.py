@@ -23,6 +23,7 @@ class SupervisionReason(ReasonKind):
     )
     STATE_JUMPED = "state_jumped", "{joint} jumped by {distance:.3f} rad"
     JOINT_STATES = "joint_states", "joint states: {cause}"
+    PLANT_FAULT = "plant_fault", "the plant reports a fault: {cause}"
     OFF_REFERENCE = (
         "off_reference",
         "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s; "

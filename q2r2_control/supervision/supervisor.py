@@ -83,6 +83,7 @@ class Supervisor:
         self.homing = Homing(robot, controller, tools_only=external is not None)
         self._standing = None if standstill is None else StandingArms(robot, standstill, self._origins.takers)
         self._stopped: Reason | None = None  # Why the arms stop until a reset; None if they do not.
+        self._reported: Reason | None = None  # The newest fault that the plant has reported by itself.
         self._last: Reference | None = None
         # Why arms that followed targets ceased to follow them; None after an arm follows targets again.
         self.ceased: Reason | None = None
@@ -145,9 +146,16 @@ class Supervisor:
             self._watch.observe(state, now, passed)
         else:
             self._watch.lose(lost)
+            if self._watch.fault is lost:  # An earlier fault is kept.
+                self._reported = lost
         fault = self._watch.fault
         if self.phase is Phase.INACTIVE and fault is not None and fault != before:
-            self.events.append(Reason(SupervisionReason.JOINT_STATES, cause=fault))
+            self.events.append(self._with_origin(fault))
+
+    def _with_origin(self, fault: Reason) -> Reason:
+        """Return ``fault`` as the cause of a reason which says whether the plant or the joint states told it."""
+        kind = SupervisionReason.PLANT_FAULT if fault is self._reported else SupervisionReason.JOINT_STATES
+        return Reason(kind, cause=fault)
 
     def update_target(
         self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None, due: float | None = None
@@ -201,7 +209,7 @@ class Supervisor:
         if self.phase is Phase.STOPPED:
             return None
         if self.phase is Phase.ACTIVE and fault is not None:
-            self._brake(Reason(SupervisionReason.JOINT_STATES, cause=fault))
+            self._brake(self._with_origin(fault))
         elif apart := self.skew.fault(now):
             self.start_over(apart, now)
         if ended := self.targets.expire(now):

@@ -1,8 +1,10 @@
-"""An input, a plant, a task and a preset of another package, which are written and declared as in docs/extending.md."""
+"""The package of docs/extending.md: its input, plants, task, preset and command are installed and run unchanged."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -37,7 +39,8 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the shipped cell with the YAML of docs/extending.md. Its package and a broken plugin are installed."""
     groups: dict[str, dict[str, str]] = {}
     for block in blocks_of(PAGE, "toml"):
-        groups |= tomllib.loads(block)["project"]["entry-points"]
+        for group, entries in tomllib.loads(block)["project"]["entry-points"].items():
+            groups.setdefault(group, {}).update(entries)
     groups["q2r2_control.inputs"]["broken"] = "my_package:Nothing"
     groups["q2r2_control.presets"]["no_preset"] = "my_package:LaggingPlant"
     lines: list[str] = []
@@ -101,9 +104,12 @@ def test_the_input_in_docs_extending_engages_in_a_real_time_run_too(file: Path) 
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"input": "joystick"}, "input 'joystick': allowed are broken, headset, policy, scripted, swing"),
+        (
+            {"input": "joystick"},
+            "input 'joystick': allowed are broken, headset, policy, recording, scripted, swing, web, webxr",
+        ),
         ({"input": "broken"}, "broken = my_package:Nothing"),
-        ({"plant": "gazebo"}, "plant 'gazebo': allowed are fri, kinematic, lagging, mujoco, ros"),
+        ({"plant": "gazebo"}, "plant 'gazebo': allowed are fri, kinematic, lagging, mujoco, ros, thermal"),
         (
             {"teleop": {"bindings": {"grip": "carry"}}},
             "grip = carry: this input has no press_middle; allowed: device.pedal",
@@ -123,6 +129,49 @@ def test_the_command_check_prints_one_line_about_a_missing_plugin_or_control_and
     assert told in checked.stderr
     with pytest.raises(ConfigError, match=re.escape(told)):
         Pipeline.from_config(load_config(str(file)))
+
+
+def called(file: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run q2r2 in a process that finds the package beside ``file``."""
+    path = os.pathsep.join([str(file.parent), *filter(None, sys.path)])
+    command = [sys.executable, "-m", "q2r2_control", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path})
+
+
+@pytest.mark.slow
+def test_the_plant_in_docs_extending_reports_a_fault_that_its_command_finds_in_the_recording(file: Path) -> None:
+    """The motion heats the drives within two seconds. They cool down while the arms rest."""
+    hot = {"allowed": 60, "heating": 20000.0, "cooling_time": 0.2}
+    changes = {"loop_rate_hz": 500, "plant_settings": {"thermal": hot}}
+    shipped = read_yaml(find_resource(CELL).read_text(encoding="utf-8"))
+    cell = str(changed(file.with_name("hot.yaml"), merged(shipped, changes)))
+    folder = file.parent / "recordings"
+    run = called(file, "run", cell, "--plant", "thermal", "--fast", "--duration", "3", "--record", str(folder))
+    assert re.search(r"the plant reports a fault: the drive of \w+ is hotter than 60 degrees\n", run.stderr), run.stderr
+    assert "active: the reference starts at the measured posture" in run.stderr
+    listed = called(file, "hot-drives", str(folder)).stdout.splitlines()
+    assert {line.split(" s, ")[1].split(":")[0] for line in listed} == {"left arm", "right arm"}
+    assert all(re.search(r"the drive of \w+ is hotter than 60 degrees$", line) for line in listed)
+    assert "hot-drives" in called(file, "--help").stdout
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"allowed": 400.0}, "plant_settings.thermal: allowed = 400.0: allowed: 200 or less"),
+        ({"alowed": 60.0}, "plant_settings.thermal: alowed = 60.0: unknown key; did you mean allowed?"),
+    ],
+    ids=["value", "key"],
+)
+def test_a_wrong_setting_of_the_plant_in_docs_extending_is_named_by_check_and_run(
+    file: Path, settings: dict[str, float], told: str
+) -> None:
+    """The command check also checks the blocks of plants that are not the cell's."""
+    cell = str(changed(file, {"plant": "lagging", "plant_settings": {"thermal": settings}}))
+    for arguments in (("check", cell), ("run", cell, "--plant", "thermal")):
+        refused = q2r2(*arguments)
+        assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+        assert told in refused.stderr
 
 
 def test_a_device_without_any_control_is_refused() -> None:
