@@ -258,7 +258,10 @@ class StackJudge(Judge):
 
 
 class HandoverJudge(Judge):
-    """One hand holds a part in the air, then both hands do, then the other hand alone, 100 mm away for a second."""
+    """One hand holds a part in the air. Then both hands hold it. Then the other hand holds it alone for a second.
+
+    The other hand has to hold it at least 100 mm from the position at which the first hand let go.
+    """
 
     def __init__(self, part: str, giver: int, taker: int) -> None:
         super().__init__(part)

@@ -277,7 +277,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
                     os.fsync(stream.fileno())
         if not target.exists():
             unfinished.replace(target)
-    except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
+    except RecordingError as error:  # Pictures are read only while they are written, so this error can still occur.
         return None, _reason(error, job)
     except OSError as error:
         raise ConfigError(f"--output {target.parent}: {error.strerror or error}; {_OUTPUT}") from error

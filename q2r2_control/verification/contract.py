@@ -38,13 +38,13 @@ def time_of(dt: Any) -> float:
 
 
 class Contract:
-    """Checks one reference after another, from a start at ``q`` [rad], ``v`` [rad/s], (nv,) each; by default at home.
+    """Checks one reference after another.
 
-    A start outside the limits, too fast or in penetration is allowed. For the limits that the start breaks, the promise
-    is to recover, and separate margins check that. Coal measures distances between ticks and during full stops, in
-    ticks that ``random`` chooses, or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the
-    joints move along several parabolas. The reference does not contain these parabolas, so only the tick's end is
-    checked.
+    The start is at ``q`` (nv,) [rad] with ``v`` (nv,) [rad/s]; by default at rest at home. A start outside the limits,
+    too fast or in penetration is allowed. For the limits that the start breaks, the promise is to recover, and separate
+    margins check that. Coal measures distances between ticks and during full stops, in ticks that ``random`` chooses,
+    or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the joints move along several
+    parabolas. The reference does not contain these parabolas, so only the tick's end is checked.
     """
 
     def __init__(
