@@ -180,7 +180,7 @@ class _Probe:
         while time.monotonic() < end:
             beside()
             message.pose.position.z = height + _STEP_SIZE * (len(steps) % 2)
-            steps.append(time.time())  # The middleware's stamps have the same clock.
+            steps.append(time.time())  # The middleware's stamps are times of this clock too.
             publisher.publish(message)
             self._spin(random.uniform(*_STEP_PAUSES_S))
         if not self._commands:

@@ -141,7 +141,7 @@ class _CompilingLines:
         self._due = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print a line if it is due. It estimates the remaining time, assuming that all kernels take equally long."""
+        """Print a line if it is due. The line has the remaining time, estimated as if all kernels took equally long."""
         now = time.monotonic()
         if self._start is None:
             self._start, self._due = now, now + _SILENT_S

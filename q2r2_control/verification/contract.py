@@ -98,7 +98,7 @@ class Contract:
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
         """Take the ``openings`` that the controller has accepted.
 
-        ``before_step`` is False if it is known only after a step that the controller has accepted them.
+        ``before_step`` is False if the caller learns only after a step that the controller has accepted them.
         """
         if before_step:
             self._stop = self._controller.stop_deceleration
@@ -256,7 +256,7 @@ class Contract:
         return np.asarray(np.maximum(np.abs(v) - self._v_max * (1.0 + RELATIVE), 0.0))
 
     def _stops_inside(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
-        """Return which joints are inside their limits, and stay there by full braking that begins one substep late."""
+        """Return which joints are inside their limits, and stay there if full braking begins one substep later."""
         end = q + v * np.abs(v) / (2.0 * self._a) + v * self._substep
         inside = (np.minimum(q, end) >= self._lower) & (np.maximum(q, end) <= self._upper)
         return np.asarray(inside, dtype=np.bool_)
