@@ -203,7 +203,7 @@ def _capsules_note(config: Config, robot: Robot) -> str:
     """
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
-    # Without the additional shapes, some pairs of ``control.pairs`` would not exist, so all of them are left out.
+    # Without the additional shapes, some pairs of ``control.pairs`` would not exist. So ``control.pairs`` is left out.
     settings = config.control.model_copy(update={"pairs": ()})
     robots = (robot, Robot.from_config(config.model_copy(update={"capsules": {}, "control": settings})))
     steps = []

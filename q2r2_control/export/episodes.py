@@ -273,7 +273,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
-                    # Thus no episode under its final name is incomplete after a power failure.
+                    # Otherwise, a power failure could leave an incomplete episode under its final name.
                     os.fsync(stream.fileno())
         if not target.exists():
             unfinished.replace(target)

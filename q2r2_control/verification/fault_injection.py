@@ -131,7 +131,7 @@ class FaultySolver:
 
 
 class PushingSolver:
-    """A solver that drives all joints as fast as the box allows, for some ``ticks`` in each of many directions."""
+    """A solver that drives all joints as fast as the box allows, for ``ticks`` ticks in each of many directions."""
 
     def __init__(self, ticks: int) -> None:
         self._random, self._ticks, self._left = np.random.default_rng(72), ticks, 0

@@ -25,7 +25,7 @@ _LOOKS = 0.01  # Time between two checks of the robots during a wait [s].
 
 
 class FrankaPlant:
-    """A plant of real arms. Each motion starts at the present posture, also after a robot has ended the previous one."""
+    """A plant of real arms. Each motion starts at the present posture, even if a robot ended the previous one."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
     settings = FrankaSettings

@@ -205,7 +205,7 @@ class PageView(Page):
 def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:
     """Return a function for each slider, which gets the slider's value.
 
-    Speeds stay within the cell's speeds. A value that is not allowed changes nothing.
+    A slider cannot set a speed above the cell's own speed. A value that is not allowed changes nothing.
     """
     control, teleop, impedance = pipeline.config.control, pipeline.config.teleop, pipeline.config.impedance
 
