@@ -18,8 +18,8 @@ ARRIVAL_DISTANCE_M = 0.01  # A tool that is nearer than this to its target has a
 ARRIVAL_TIMEOUT_S = 0.5  # Longest time that a target at its goal waits for its tool to arrive [s].
 _MAX_MEASURED_DISTANCE_M = 0.05  # Distances between the arms are measured only below this [m].
 _STEPS_PER_MEASUREMENT = 20  # Number of physics steps from one measurement of the distance to the next.
-# A smaller excess over a limit counts as a rounding error. It is in [rad] for positions, and a share of the limit for
-# velocities.
+# If a joint exceeds a limit by less than this, the excess counts as a rounding error. The excess is an angle [rad] for
+# a position limit, and a share of the limit for a velocity limit.
 _LIMIT_TOLERANCE = 1e-3
 
 
@@ -107,7 +107,8 @@ class Judge:
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]
     contacts: int = 0  # Number of times that the arms began to touch each other.
-    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms [m]; this maximum if they were farther.
+    # Least distance between the arms [m]; _MAX_MEASURED_DISTANCE_M if they were always farther apart than this.
+    nearest: float = _MAX_MEASURED_DISTANCE_M
     beyond_position: float = 0.0  # Largest angle by which a joint exceeded a position limit [rad].
     velocity_ratio: float = 0.0  # Largest velocity of a joint, divided by its limit.
     _touching: bool = field(default=False, init=False)

@@ -1,4 +1,4 @@
-"""What can attacks achieve that do not use targets: hostile solvers, invalid arguments, and a loop that stalls?"""
+"""What can attacks without targets achieve? They use hostile solvers, invalid arguments, and a loop that stalls."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Row:
 
 
 class _Writer:
-    """A solver that widens the limits in its problem if it can write them, and returns velocities beyond the limits."""
+    """A solver that widens the limits in its problem if it can, and returns velocities beyond the limits."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         for array, change in ((problem.lower, -1.0), (problem.upper, 1.0), (problem.rows_lower, -1.0)):

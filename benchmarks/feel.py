@@ -1,4 +1,4 @@
-"""How does a filter feel to an operator: how late is the tool, how much tremor and noise is left, how does it stop?
+"""How does a filter feel to an operator: how late is the tool, how does it stop, how much tremor and noise is left?
 
 A scripted hand oscillates at single frequencies, reaches, trembles, rests, and moves and stops. The tool is measured
 through the whole chain: samples at a headset's rate, teleoperation, the controller, and an arm in MuJoCo. A tone is a

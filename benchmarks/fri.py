@@ -120,8 +120,8 @@ class ToolWay:
 def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[str, float | None]]:
     """Run without cabinets in simulated time, and return two errors of the measured tools [mm RMS].
 
-    The first error is the distance from the reference, over all arms. The second is the distance from the targets, by
-    arm; None if the arm was not engaged.
+    The first error is the distance of all tools from the reference. The second error is the distance of each tool from
+    its targets, by arm. It is None for an arm that was not engaged.
     """
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
@@ -215,7 +215,8 @@ def main(
     """Print how long cabinets wait for their answers, how many answers they missed, and the error of the arms."""
     data = measure(mode, duration, rt, options or [])
     keys = "engaged_s", "error_mm_rms", "direct_errors_mm_rms"
-    # The last end of a session is the end of this run, so it is left out.
+    # A cabinet reports why each of its FRI sessions ended. The last session ended because this run ended, so its reason
+    # is left out.
     rows = [
         (arm, *(data[key][arm] for key in keys), its["missed"], ", ".join(its["trips"][:-1]) or "-")
         for arm, its in data["cabinets"].items()

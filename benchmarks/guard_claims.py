@@ -1,8 +1,8 @@
 """Lines outside the certificate that keep arms safe, each with a change that breaks it: see safety_mutations.py.
 
 The lines are in the controller around its kernels, in supervision, and in code that checks the age of data, such as
-targets and measured states. Other lines make both arms brake if one arm is late on their common reference. Every row
-names a claim and one line that keeps it.
+targets and measured states. Both arms follow one common reference. Other lines make both arms brake if one of them is
+too far behind on this reference. Every row names a claim and one line that keeps it.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def main(loop_rate: LoopRate = None, seconds: Seconds = DURATION_S, json: Json =
                 env.step(ACTION_SHARE * action())
             steps, began, computing = 0, time.perf_counter(), time.process_time()
             while (passed := time.perf_counter() - began) < seconds:
-                # Here a step gives robosuite's done, or gymnasium's terminated and truncated.
+                # These items of the result are robosuite's done, or gymnasium's terminated and truncated.
                 if any(env.step(ACTION_SHARE * action())[2:-1]):
                     env.reset()
                 steps += 1

@@ -1,10 +1,10 @@
 """How long does each stage of a tick of the whole live loop take, with each plant and mode?
 
-Ticks come at the loop's rate, because a tick would find warmer caches if it followed the last tick at once. Time in the
-run is still simulated, so the arms make the same motion in every round, on a busy machine too. The cases run in turns.
-Rounds that time each stage alternate with rounds that time only the whole tick. In a third kind of round, each tick
-follows the last tick at once. Such rounds show the time of the program itself: the loop does not sleep between ticks,
-so no other program can change the caches.
+Ticks come at the loop's rate, because a tick would find warmer caches if it followed the previous tick at once. Time in
+the run is still simulated, so the arms make the same motion in every round, on a busy machine too. The cases run in
+turns. Rounds that time each stage alternate with rounds that time only the whole tick. In a third kind of round, each
+tick follows the previous tick at once. Such rounds show the time of the program itself: the loop does not sleep between
+ticks, so no other program can change the caches.
 """
 
 from __future__ import annotations

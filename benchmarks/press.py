@@ -74,7 +74,8 @@ class PressFigures:
     impact_speed: float  # Speed of the tool in the tick before it first touches the table [m/s].
     impact_force: float  # Largest force in the first 0.25 s of contact [N].
     steady_force: float  # Mean force while the tool presses without sliding [N].
-    spring_force: float  # Stiffness times the tool's mean height above its reference during the same time [N].
+    # Stiffness times the tool's mean height above its reference while the tool presses without sliding [N].
+    spring_force: float
     largest_force: float  # Largest force of the whole run [N].
     bound: float  # Stiffness times the largest allowed depth of the reference [N].
     bounce_s: float  # Time without contact between the first touch and the slide [s].
@@ -102,7 +103,7 @@ def run_press(config: Config, slide: PressSlide, rotor_share: float, friction: f
     Raises :class:`ConfigError` if none of the left arm's fingers may touch the table.
     """
     mujoco = config.mujoco.model_copy(update={"rotor_share": rotor_share, "obstacle_friction": friction})
-    # Time is simulated, so no solution may count as late, however busy the machine is.
+    # Time is simulated. A solution that takes long on a busy machine must therefore not count as late.
     control = config.control.model_copy(update={"solve_time_limit": None})
     config = config.model_copy(update={"mujoco": mujoco, "control": control})
     robot = Robot.from_config(config)

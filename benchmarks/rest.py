@@ -25,8 +25,8 @@ from q2r2_control.viewer.tables import record_table
 RUNS_PER_KIND = 50  # Number of runs of each kind.
 DURATION_S = 30.0  # Duration of a run [s].
 DT = 0.001  # Period of a tick [s].
-# Arms count as resting if this acceleration is not larger: the RMS, over the last 0.5 s, of the norm of all joints'
-# accelerations [rad/s^2].
+# Arms count as resting if their acceleration is at most this [rad/s^2]. Their acceleration is the RMS, over the last
+# 0.5 s, of the norm of all joints' accelerations.
 MAX_REST_ACCELERATION = 0.1
 # Jolts are counted after this time [s], when the jump of the targets has no more effect and the arms slide.
 JOLTS_COUNT_AFTER_S = 2.0
@@ -61,7 +61,8 @@ class RestFigures:
     worst_acceleration: float  # Largest acceleration of any run [rad/s^2].
     # Mean number of ticks of a run after JOLTS_COUNT_AFTER_S in which an acceleration changes by more than JOLT.
     jolts: float
-    most_jolts: int  # Largest number of such ticks in one run.
+    # Largest number of ticks of one run after JOLTS_COUNT_AFTER_S in which an acceleration changes by more than JOLT.
+    most_jolts: int
     fallback_ticks: int  # Number of ticks of all runs in which the certified stop was executed.
 
 

@@ -71,7 +71,7 @@ class LatencyReport:
 
     loop_rate_hz: float  # Configured loop rate of the controller.
     transport_p50_ms: float  # Median time that a joint command takes between two processes. All rows include it.
-    transport_p99_ms: float  # 99th percentile of the same time.
+    transport_p99_ms: float  # 99th percentile of the time that a joint command takes between two processes.
     rows: tuple[LatencyRow, ...]
 
 
@@ -150,8 +150,8 @@ class _Probe:
     def engage_hand(self) -> None:
         """Press the lower button until the arm's node keeps publishing targets.
 
-        If a press is answered late, the next press may already pause the arm again. Therefore only targets count that
-        come after the buttons were released, not those that came during a press.
+        If the node answers a press late, the next press can already pause the arm again. Therefore this method counts
+        only targets that come after the button was released. Targets that come during a press do not count.
         """
         targets: list[PoseStamped] = []
         subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
@@ -180,7 +180,7 @@ class _Probe:
         while time.monotonic() < end:
             beside()
             message.pose.position.z = height + _STEP_SIZE * (len(steps) % 2)
-            steps.append(time.time())  # The middleware's stamps have the same clock.
+            steps.append(time.time())  # The middleware's stamps are times of this clock too.
             publisher.publish(message)
             self._spin(random.uniform(*_STEP_PAUSES_S))
         if not self._commands:

@@ -152,7 +152,7 @@ class _Hand:
         """Press, and record what follows for longer than :data:`WATCHED_S`."""
         for times in (self._ticks, self._targets, self._commands, self._speeds):
             del times[:-1]
-        press = time.time()  # The middleware's stamps have the same clock.
+        press = time.time()  # The middleware's stamps are times of this clock too.
         self._press()
         return PressRecording(
             press, tuple(self._ticks), tuple(self._targets), tuple(self._commands), tuple(self._speeds)

@@ -118,7 +118,8 @@ def main(
     from playwright.sync_api import sync_playwright  # The import is here, because only this function needs playwright.
 
     config = WebXrInput.cell(load_config(DEMO_CONFIG))
-    # A browser without a graphics card may pause longer than an arm waits. This timeout lets such pauses be measured.
+    # A browser without a graphics card sometimes pauses for longer than the default timeout. The arm would then stop.
+    # With this longer timeout, such pauses are measured.
     gate = config.teleop.gate.model_copy(update={"timeout": _MAX_LATENCY_S})
     config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
     source = WebXrInput(port=0, watch=HandsWatch(None, frame=False))

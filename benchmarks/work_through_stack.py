@@ -56,7 +56,7 @@ class StackFigures:
     arrival_s: float | None = None
     fallback_percent: float | None = None  # Percentage of ticks in which the certified stop was executed.
     measured_distance_mm: float | None = None  # Least distance of a monitored pair at measured postures, from Coal.
-    measured_pair: tuple[str, str] | None = None  # The pair with that distance.
+    measured_pair: tuple[str, str] | None = None  # The pair with measured_distance_mm.
     measured_margin_mm: float | None = None  # Least difference between a pair's measured and kept distance.
     reference_distance_mm: float | None = None  # Least distance of a monitored pair at the reference's postures.
     max_acceleration_ratio: float | None = None  # Largest acceleration of the reference, divided by the joint's limit.
@@ -65,7 +65,7 @@ class StackFigures:
     rest_acceleration: float | None = None
     slip_mm: float = 0.0  # Largest distance by which the leash moved a target.
     pauses: list[str] = field(default_factory=list)  # Reasons why an arm was paused during the run.
-    stopped: str | None = None  # Reason why the run was stopped before its end, None if it was not.
+    stopped: str | None = None  # Reason why the run was stopped early; None if it was not stopped early.
     broken: dict[str, int] = field(default_factory=dict)  # Number of ticks that broke each promise of the controller.
 
     @property

@@ -12,7 +12,7 @@ class DeviceWords:
     """Words of one device. A control without a noun is called by its name in the cell's bindings."""
 
     nouns: Mapping[str, str] = field(default_factory=dict, hash=False)  # Nouns by control.
-    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # Verbs of controls, if not "press" or "hold".
+    verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # Verbs by control; else "press" or "hold".
     # Text while no device is connected; empty if the device's own controls connect it.
     absent: str = "nothing: no input is connected"
     nobody: str = ""  # Why no person presses anything; empty if a person does.

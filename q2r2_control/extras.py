@@ -12,7 +12,7 @@ from pathlib import Path
 
 from q2r2_control.errors import MissingPackageError
 
-# By extra, its packages. Other extras are checked where they are used.
+# The packages of each extra, by its name. Other extras are checked where they are used.
 PACKAGES = {
     "sim": ("mujoco", "pillow"),
     "data": ("mcap", "rosbags", "zstandard", "matplotlib", "pillow"),
@@ -30,8 +30,9 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 def install_line(extra: str) -> str:
     """Return the pip command that installs an ``extra`` of this package, from any working directory.
 
-    The package is on no package index, so a checkout is named by its folder. Lerobot gets an environment of its own in
-    a checkout, because of its size. If the environment of this Python is not activated, the line names the Python.
+    The package is on no package index, so in a checkout the command names the checkout's folder. lerobot is large, so a
+    checkout has a separate environment for it. If the environment of this Python is not activated, the line names the
+    Python.
     """
     is_checkout = (_CHECKOUT / "pyproject.toml").is_file()
     if extra == "lerobot" and is_checkout:
@@ -45,7 +46,7 @@ def install_line(extra: str) -> str:
 def plugin_line(package: str) -> str:
     """Return the pip command that installs a ``package`` of the folder plugins/.
 
-    Without a checkout, the working directory has to be one.
+    If this package is not in a checkout, the command works only in the folder of a checkout.
     """
     folder = Path("plugins") / package
     return f"{_pip()} install -e {shlex.quote(str(_CHECKOUT / folder if (_CHECKOUT / folder).is_dir() else folder))}"
@@ -83,7 +84,7 @@ def _listed(names: list[str]) -> str:
 def _is_installed(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # The package of the module is missing, too.
+    except ModuleNotFoundError:  # ``find_spec`` raises this if the package that contains the module is missing.
         return False
 
 

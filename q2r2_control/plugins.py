@@ -27,7 +27,7 @@ COMMANDS = "q2r2_control.commands"
 # By group and name, the folders in plugins/ of packages that are not installed with this one.
 _OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
 
-# By group and name, the extras of classes that need one.
+# For each class that needs the packages of an extra: the extra, by group and name.
 _EXTRAS = {
     (INPUTS, "headset"): "headset",
     (INPUTS, "web"): "web",

@@ -289,7 +289,7 @@ class StepReport:
     slack: float  # Largest violation of a row of the QP [rad/s]. All rows have unit norm.
     solve_time: float  # Time of the solver [s]; 0 if the solver was not needed.
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
-    margin: float = math.inf  # Distance of that pair minus the distance that it has to keep [m].
+    margin: float = math.inf  # Distance of the tightest pair minus the distance that it has to keep [m].
     unsolved: int = 0  # Bit i is set if the QP of substep i had no solution in time, so that the stop was executed.
     faults: tuple[str, ...] = ()  # Why targets, or answers of the user's tasks, constraints and solver, were not used.
 
@@ -298,13 +298,13 @@ class StepReport:
 class Reference:
     """The certified joint motion of one tick.
 
-    ``a`` is the mean acceleration from the last tick's velocity to ``v``. Its integral is not exactly ``q``, because
-    the acceleration may change between substeps.
+    ``a`` is the mean acceleration from the previous tick's velocity to ``v``. Its integral is not exactly ``q``,
+    because the acceleration may change between substeps.
     """
 
     q: Array  # (nv,) Joint positions [rad].
     v: Array  # (nv,) Joint velocities [rad/s].
-    a: Array  # (nv,) Mean joint accelerations since the last tick [rad/s^2].
+    a: Array  # (nv,) Mean joint accelerations since the previous tick [rad/s^2].
     report: StepReport
 
 

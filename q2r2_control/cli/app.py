@@ -37,7 +37,7 @@ class ErrorHandlingGroup(TyperGroup):
             self.add_command(CommandOnDemand(command))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of this name, which may be that of another package; None if there is none."""
+        """Return the command of this name, from this or another package; None if there is none."""
         found = super().get_command(ctx, cmd_name)
         others = () if found is not None else installed_commands()  # Reading the entry points takes some time.
         return next((CommandOnDemand(other) for other in others if other.name == cmd_name), found)
@@ -102,7 +102,7 @@ class _StderrHandler(logging.Handler):
     """Writes the log to the current ``sys.stderr``. Thus lines appear above a live table, and not within the table."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        with suppress(OSError):  # The terminal may be closed.
+        with suppress(OSError):  # Printing fails if the terminal was closed.
             print(self.format(record), file=sys.stderr)
 
 

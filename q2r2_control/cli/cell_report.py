@@ -143,9 +143,10 @@ def check_cell(config: Config) -> CellCheck:
 
 
 def _installed_classes(config: Config) -> tuple[list[Any], list[str]]:
-    """Return the classes of the cell's input and plant, and a note for each that needs a package of an extra.
+    """Return the classes of the cell's input and plant, and notes about missing packages.
 
-    The class is then None. A missing package is not a fault of the cell, which may run on another computer.
+    If a class needs a missing package, the class is None, and a note names the package. A missing package is not a
+    fault of the cell, because another computer may have it.
     """
     classes: list[Any] = []
     notes: list[str] = []
@@ -202,7 +203,7 @@ def _capsules_note(config: Config, robot: Robot) -> str:
     """
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
-    # Without the additional shapes, some pairs of ``control.pairs`` would not exist, so all of them are left out.
+    # Without the additional shapes, some pairs of ``control.pairs`` would not exist. So ``control.pairs`` is left out.
     settings = config.control.model_copy(update={"pairs": ()})
     robots = (robot, Robot.from_config(config.model_copy(update={"capsules": {}, "control": settings})))
     steps = []

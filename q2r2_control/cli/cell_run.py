@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 
 _SHOWS_PICTURES = "show_picture"  # An input has this method if its device can show the run, as a headset can.
 _PERIOD = 1.0 / 30.0  # Period at which the window is drawn [s].
-# Largest number of pictures per second: on a page, of all cameras together; in a headset, of the one camera in it.
+# Largest number of pictures per second. On a page, it counts the pictures of all cameras together. A headset shows only
+# one camera.
 _ON_PAGE, _IN_HEADSET = 5.0, 30.0
 
 
@@ -198,7 +199,7 @@ def _run_cell(
     try:
         plant = make_plant(options.plant, robot, config)
     except PlantError as error:
-        if options.plant != "mujoco":  # The error below has the words of q2r2 check, which builds only the simulation.
+        if options.plant != "mujoco":  # q2r2 check reports the error below, but only for MuJoCo.
             raise
         raise PlantError(f"{config.name}: FAULT plant {options.plant}: {error}") from error
     if isinstance(plant, WaitingPlant):

@@ -47,7 +47,7 @@ def evaluate(
     """
     require("sim", "q2r2 evaluate")
     cell, chosen = load_config(config), tasks_named(tasks)
-    # The policy is made once here, so that one line says what is wrong with it.
+    # The policy is made once here. If it cannot be made, the command ends with one line that says why.
     PolicyInput.from_config(cell, policy, named="MODULE:NAME")
     spec = find_spec(policy.partition(":")[0])
     module = None if spec is None or not spec.has_location else Path(str(spec.origin))

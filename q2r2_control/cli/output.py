@@ -141,7 +141,7 @@ class _CompilingLines:
         self._due = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print a line if it is due. It estimates the remaining time, assuming that all kernels take equally long."""
+        """Print a line if it is due. The line has the remaining time, estimated as if all kernels took equally long."""
         now = time.monotonic()
         if self._start is None:
             self._start, self._due = now, now + _SILENT_S
@@ -181,9 +181,9 @@ def counted(number: int, noun: str, plural: str | None = None) -> str:
 
 
 def positive(option: str, value: float | None) -> float | None:
-    """Return ``value``, the value of ``option`` [s]; it may be None.
+    """Return the ``value`` [s] that the user gave to ``option``; None if the user gave none.
 
-    Raises :class:`ConfigError` if it is not positive and finite.
+    Raises :class:`ConfigError` if the value is not positive and finite.
     """
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")

@@ -183,7 +183,8 @@ def run(
     )
     try:
         done = run_cell(cell, options)
-    except SystemExit as error:  # With --fast, the policy runs in this thread. Its exit could end the command with 0.
+    # With --fast, the policy runs in this thread. If it called sys.exit(0), the command would end with exit code 0.
+    except SystemExit as error:
         raise InputError(f"the run was ended by SystemExit({error.code}); allowed: a policy that returns") from error
     print_summary(done, json, verbose)
     if done.summary.broken:
@@ -281,7 +282,7 @@ def demo(
         from q2r2_control.plants.mujoco_cameras import window_fault  # The import is here, because run needs no MuJoCo.
 
         viewer = window_fault() is None
-        # Port 0 is any free port, because another program may use the usual one.
+        # Another program may already use the usual port. Port 0 therefore stands for any free port.
         web, usual_port = not viewer and find_spec("viser") is not None, 0
         if not (viewer or web):
             unseen = f"no display: to see the arms in a browser, type {install_line('web')}"
@@ -299,7 +300,7 @@ def demo(
         table=table,
         window=viewer,
         page=(web_host, usual_port if web_port is None else web_port, None) if web else None,
-        real_time=rt or plant == "fri",  # A cabinet does not wait if a busy computer answers late.
+        real_time=rt or plant == "fri",  # Cabinets do not wait for the late answers of a busy computer.
         tasks=chosen,
         steps=work.steps,
         record=record,

@@ -85,7 +85,7 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
 
 
 def _faults(summary: RunSummary) -> Iterator[tuple[str, str]]:
-    """Yield each arm's last pause by a fault, with the number of such pauses, and a refusal if it is the last event."""
+    """Yield each arm's last pause by a fault, the number of such pauses, and its last event if that is a refusal."""
     last = _last_faults(summary)
     for name in summary.arms:
         pauses = [event for event in summary.events if event.arm == name and is_fault(event) and not is_refusal(event)]

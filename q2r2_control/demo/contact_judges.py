@@ -9,8 +9,8 @@ from q2r2_control.demo.part_judges import FINGERS, HELD_TIME, Judge, PartState, 
 
 _FORCE = (5.0, 15.0)  # The least and the largest force with which the part has to press on the table [N].
 _MEAN_TIME = 0.05  # The time constant of the mean force [s].
-# Least length of the path on which the part presses with such a force [m]. Largest length of the path on which it
-# presses with another force, as a share of the length with such a force.
+# Least length of the path on which the part presses with a force within _FORCE [m]. Largest length of the path on which
+# it presses with another force, as a share of the length with a force within _FORCE.
 _WIPED, _ASTRAY = 0.3, 0.1
 _DEEP, _BESIDE = 0.003, 0.001  # The peg's largest distance from the bottom of the hole, and from the hole's middle [m].
 _STRAIGHT = math.radians(3.0)  # The largest tilt of the peg and of the part with the hole [rad].
@@ -23,7 +23,8 @@ class WipeJudge(Judge):
         super().__init__(part)
         # The part's last position [m]; None if fingers did not hold the part, or if it was not on the table.
         self._place: tuple[float, float] | None = None
-        # The mean force and its largest value so far [N]; the path with the wanted force and with another force [m].
+        # _force: the mean force [N]. _most: the largest mean force so far [N]. _wiped: the length of the path with a
+        # force within _FORCE [m]. _astray: the length of the path with another force [m].
         self._force = self._most = self._wiped = self._astray = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
@@ -60,11 +61,12 @@ class PegJudge(Judge):
     """A part stands straight at the bottom of the hole of another part, without a finger on it, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
-        """``parts`` has, by name of a part, the height of the peg and then the height of the hole's bottom [m]."""
+        """``parts`` has two heights [m] by name of the part: of the peg, and then of the bottom of the hole."""
         super().__init__(*parts)
         self._rest = 0.5 * sum(parts.values())  # Vertical distance of the centres when the peg is at the bottom [m].
-        # The time for which the peg has stood in the hole [s]; its distance from the hole's middle, and its height
-        # above its lowest position [m]; the larger tilt of both parts [rad].
+        # _stood: the time for which the peg has stood in the hole [s]. _beside: the distance of the peg from the hole's
+        # middle [m]. _above: the height of the peg above its lowest position [m]. _tilt: the larger tilt of both parts
+        # [rad].
         self._stood = self._beside = self._above = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:

@@ -162,8 +162,9 @@ class LiftJudge(Judge):
     def __init__(self, part: str) -> None:
         super().__init__(part)
         self._start: tuple[float, float, float] | None = None  # The position at the start [m].
-        # Four numbers: the time for which the part has been held up until now, and the longest such time [s]; the
-        # greatest height of the part above the start [m]; the time for which it has lain at the start again [s].
+        # _held: the time for which the part has been held up until now [s]. _longest: the longest such time [s].
+        # _height: the greatest height of the part above the start [m]. _lain: the time for which the part has lain at
+        # the start again [s].
         self._held = self._longest = self._height = self._lain = 0.0
         self._away = (0.0, 0.0)  # The distance from the start, sideways and in height [m].
 
@@ -258,14 +259,17 @@ class StackJudge(Judge):
 
 
 class HandoverJudge(Judge):
-    """One hand holds a part in the air, then both hands do, then the other hand alone, 100 mm away for a second."""
+    """One hand holds a part in the air. Then both hands hold it. Then the other hand holds it alone for a second.
+
+    The other hand has to hold it at least 100 mm from the position at which the first hand let go.
+    """
 
     def __init__(self, part: str, giver: int, taker: int) -> None:
         super().__init__(part)
         self._giver, self._taker = giver, taker
-        # Five numbers: the times for which the giver held the part, and for which both hands held it [s]; the time for
-        # which the taker has held it far enough away until now, and the longest such time [s]; the greatest distance of
-        # the part from the position at which the giver let go [m].
+        # _by_giver: the time for which the giver held the part [s]. _by_both: the time for which both hands held it
+        # [s]. _alone: the time for which the taker has held it far enough away until now [s]. _longest: the longest
+        # such time [s]. _farthest: the greatest distance of the part from the position at which the giver let go [m].
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
         self._given: tuple[float, float, float] | None = None  # The position at which the giver let go [m].
 

@@ -57,7 +57,7 @@ def try_tasks(
     progress: Callable[[str], None] = lambda line: None,
     reads: Path | None = None,
 ) -> list[TrialReport]:
-    """Try each task alone with the seeds 0 .. ``seeds`` - 1. The reports do not depend on the ``place`` of the trials.
+    """Try each task alone with the seeds 0 .. ``seeds`` - 1. The ``place`` of the trials does not change the reports.
 
     ``reads`` is the file that trials read; None if they read no file.
     """

@@ -273,11 +273,11 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
-                    # Thus no episode under its final name is incomplete after a power failure.
+                    # Otherwise, a power failure could leave an incomplete episode under its final name.
                     os.fsync(stream.fileno())
         if not target.exists():
             unfinished.replace(target)
-    except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
+    except RecordingError as error:  # Pictures are read only while they are written, so this error can still occur.
         return None, _reason(error, job)
     except OSError as error:
         raise ConfigError(f"--output {target.parent}: {error.strerror or error}; {_OUTPUT}") from error

@@ -164,9 +164,9 @@ class _CameraLook:
         """Return the lag [s] at which the arms' speeds s explain the change of the pictures best.
 
         The model is c_1 s_1 + c_2 s_2 + c_0, with all c >= 0. A lag that is not near zero counts only if it explains
-        the change clearly better than the lags near zero, since two motions make a wrong lag fit, too. An arm that
-        moves to and fro has the same speed again later. An arm that moves in a circle looks faster when it is near the
-        camera.
+        the change clearly better than the lags near zero. The reason is that two kinds of motion make a wrong lag fit,
+        too. An arm that moves to and fro has the same speed again later. An arm that moves in a circle looks faster
+        when it is near the camera.
 
         Return None if there are too few pictures, if they do not change, or if the best lag explains too little.
         """

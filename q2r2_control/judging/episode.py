@@ -31,7 +31,7 @@ class Ticks:
 
     number: npt.NDArray[np.int64]  # (n,) Number of the tick. Ticks are counted from 0, and lost ticks count too.
     t: Array  # (n,) Time since the run began [s].
-    dt: Array  # (n,) Time since the loop's last tick, even if the last tick is not in the file [s].
+    dt: Array  # (n,) Time since the loop's previous tick, even if that tick is not in the file [s].
     compute_time: Array  # (n,) Computing time of the tick [s].
     following: Flags  # (n,) False while the run ends and the arms come to rest.
     certified: Flags  # (n,) True if the controller had a certified stop.
@@ -65,7 +65,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class Hand:
-    """The k received samples of one hand. Their poses may not be finite."""
+    """The k received samples of one hand. Some poses can contain NaN or infinite numbers."""
 
     arm: str  # The arm that follows the hand.
     received: Array  # (k,) Time of the receipt of the pose [s].

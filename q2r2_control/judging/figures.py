@@ -21,8 +21,8 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
-# If an arm has a target in more frames than this, which are one second, its target topic must have a message. In one
-# second, even a topic with a low rate gets a message.
+# Number of frames in one second. If an arm has a target in more frames than this, its target topic must have a message,
+# because even a topic with a low rate gets a message in one second.
 _SURELY = 100
 _SHORTEST = 1e-3  # The shortest time for which an arm counts as engaged [s].
 
@@ -201,7 +201,8 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         measured={arm: measured_figures(episode, arm) for arm in episode.arms},
         cameras=camera_figures(episode),
         empty_topics=_empty_topics(episode),
-        # A refused press is no fault, since nothing moved. The pause of the other arm after a fault is no fault either.
+        # A refused press does not count as a fault, since nothing moved. If a fault of one arm also pauses the
+        # other arm, the pause of the other arm does not count.
         faults=[
             Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
             for event in episode.events

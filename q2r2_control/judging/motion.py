@@ -30,11 +30,11 @@ _STEP = 0.005  # The step between two delays, and between the times at which vel
 _DIFFERENCE = 0.025  # A velocity is computed from the positions this much earlier and this much later [s].
 _LEAST_MOTION = 0.01  # No delay is computed for a hand whose RMS speed is lower [m/s].
 _LEAST_FIT = 0.5  # The least share of the tool's motion that the hand's motion has to explain.
-# If a motion repeats itself, several delays explain it. A longer delay is therefore chosen only if the share of the
-# motion that it explains is higher by at least this for each second [1/s].
+# If a motion repeats itself, several delays explain it. A longer delay is therefore chosen only if it explains a
+# larger share of the motion. The share must be larger by at least this for each second of additional delay [1/s].
 _ALIKE = 0.01
 _LOOK = 0.5  # A tool's pose is compared with the poses that the tool has this much earlier and later [s].
-_MOVED, _TURNED = 2e-3, 0.02  # A tool moves if two such poses differ by more than this distance [m] or angle [rad].
+_MOVED, _TURNED = 2e-3, 0.02  # A tool moves if its pose differs from one of them by more than this [m, rad].
 
 
 def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:

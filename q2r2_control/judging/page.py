@@ -172,7 +172,7 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
         axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=None if number else "no arm engaged", **_SHADE)
     for number, fault in enumerate(judged.figures.faults):
         axes.axvline(fault.t, label=None if number else "fault", **_FAULT)
-    # The axis reaches to 10 at least, so that rounding errors of arms at rest are not visible.
+    # The axis reaches at least to 10 mm/s, so that rounding errors of arms at rest are not visible.
     axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))
 
 

@@ -86,7 +86,7 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
 
 def _has_foreign_marker(jpeg: bytes) -> bool:
     """Return whether the coded pixels of a JPEG were overwritten: they contain a marker that is not allowed there."""
-    scan = jpeg.rfind(_SCAN)  # The last marker counts, since a preview picture may have a marker too.
+    scan = jpeg.rfind(_SCAN)  # A JPEG may contain a preview picture, whose marker comes first.
     if scan < 0:
         return False
     begin = scan + len(_SCAN) + int.from_bytes(jpeg[scan + 2 : scan + 4], "big")

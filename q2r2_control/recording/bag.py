@@ -86,11 +86,11 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         return channels
 
     def _remove(self) -> None:
-        with suppress(OSError):  # The disk may fail again.
+        with suppress(OSError):  # Closing can fail too, for example if the disk is full.
             self._stream.close()
         with suppress(OSError):
             self._path.unlink()
-            self._path.parent.rmdir()  # The folder was made for this file.
+            self._path.parent.rmdir()  # The recorder made this folder only for this file.
 
     def write(self, messages: Iterable[Message]) -> None:
         """Add the messages of whole ticks, in the order of time.
@@ -124,7 +124,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._write_metadata({**self._about.notes, **texts})
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        with suppress(OSError):  # The disk may fail again.
+        with suppress(OSError):  # Closing can fail too, for example if the disk is full.
             self._stream.close()
         if error is None:
             return

@@ -126,14 +126,14 @@ class BaseRecorder:
 
 
 def is_empty(file: Path) -> bool:
-    """Return whether a file has no message. The file may be missing, or its writer may have been killed."""
+    """Return whether a file has no message, for example because it is missing or its writer was killed early."""
     if not file.exists():
         return True
     try:
         return not any(McapFile(file).messages())
     except EndOfFile:  # The file ends within its first message, or before it.
         return True
-    except (OSError, *BROKEN):  # The file may have messages that cannot be read now, so it must not be removed.
+    except (OSError, *BROKEN):  # The file can contain messages that cannot be read now, so it must not be removed.
         return False
 
 
@@ -204,8 +204,8 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         Args:
             parent: The folder in which the recording gets a folder of its own.
             name: The last part of the names of that folder and of the file. The first part is the date and time.
-            waits: What happens if the data that waits to be written is larger than ``room``. If True, the run waits, as
-                it may in simulated time. If False, ticks are lost and counted.
+            waits: What happens if the data that waits to be written is larger than ``room``. If True, the run waits,
+                which is allowed in simulated time. If False, ticks are lost and counted.
             room: The size of the data that may wait to be written [bytes].
             pictures: True to start one more process, which takes the pictures of the cameras of :meth:`prepare`.
         """
@@ -282,9 +282,10 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self._packer.repeat_state()
 
     def _watch_backlog(self, now: float) -> None:
-        """Warn if the file is far behind the run. If the writer were killed, all data of that time would be lost.
+        """Warn if the file is far behind the run.
 
-        A run in simulated time waits for the writer, so no warning is needed.
+        If the writer were killed, the data that is not yet in the file would be lost. A run in simulated time waits
+        for the writer, so no warning is needed.
         """
         if self._waits:
             return

@@ -255,7 +255,7 @@ class RosTicks:
             yield tick
 
     def _is_older(self, reference: float, tick: float) -> bool:
-        """Return whether the oldest waiting reference belongs to no tick, because the oldest waiting tick is newer.
+        """Return whether the oldest waiting reference is older than the oldest waiting tick, and so belongs to no tick.
 
         ``reference`` and ``tick`` are the times of these two by the controller's clock [s].
         """

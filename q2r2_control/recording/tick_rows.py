@@ -112,7 +112,7 @@ class TickPacker:
         self._state: dict[str, Any] | None = None  # The last state that was packed.
 
     def repeat_state(self) -> None:
-        """Let the next tick contain the state and the start of the run again. Call it if the last tick was lost."""
+        """Let the next tick contain the state and the start of the run again. Call it if the previous tick was lost."""
         self._state = None
 
     def pack(self, number: int, tick: Tick) -> PackedTick:
@@ -148,7 +148,7 @@ class TickPacker:
         )
 
     def _state_text(self, tick: Tick, samples: Sequence[HandSample]) -> str:
-        """Return the state of a tick as JSON; the text is empty if nothing changed since the last tick."""
+        """Return the state of a tick as JSON; the text is empty if nothing changed since the previous tick."""
         report = tick.reference.report
         state: dict[str, Any] = {
             "states": tick.states,

@@ -110,7 +110,7 @@ class Adversary:
         return self._constant({arm: pin.SE3(pose.rotation, place) for arm, pose in self._home.items()})
 
     def _unreachable(self) -> Stream:
-        """Return a stream of targets that are metres away, or astronomically far."""
+        """Return a stream of targets that are out of reach: a few metres to 1e200 m away."""
         size = 10.0 ** self._random.uniform(0.3, 200.0 if self._random.random() < 0.2 else 2.0)
         return self._constant(self._moved(lambda: self._random.normal(size=3) * size))
 
@@ -256,7 +256,7 @@ class HostileChanges:
     def grasp(self) -> tuple[str, bool] | None:
         """Return a random arm, and whether it holds its object from this tick on, or None for no change.
 
-        The arms may move at any speed at this tick, and the next change may come soon or late.
+        Arms can move at any speed when their grasp changes, and changes follow each other after random times.
         """
         if not self._with_object or self._grasps.random() > 0.02:
             return None

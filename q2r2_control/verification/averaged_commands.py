@@ -53,7 +53,7 @@ class AveragedCommands:
         self._kept.clear()
 
     def update(self, q: Array, v: Array, h: float) -> dict[str, float]:
-        """Average a reference ``q`` (nv,) [rad], ``v`` (nv,) [rad/s] that is ``h`` [s] after the last one.
+        """Average a reference ``q`` (nv,) [rad], ``v`` (nv,) [rad/s] that is ``h`` [s] after the previous one.
 
         Returns:
             The values to check, by the key of their promise; empty until enough ticks in succession were regular.

@@ -38,13 +38,13 @@ def time_of(dt: Any) -> float:
 
 
 class Contract:
-    """Checks one reference after another, from a start at ``q`` [rad], ``v`` [rad/s], (nv,) each; by default at home.
+    """Checks one reference after another.
 
-    A start outside the limits, too fast or in penetration is allowed. For the limits that the start breaks, the promise
-    is to recover, and separate margins check that. Coal measures distances between ticks and during full stops, in
-    ticks that ``random`` chooses, or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the
-    joints move along several parabolas. The reference does not contain these parabolas, so only the tick's end is
-    checked.
+    The start is at ``q`` (nv,) [rad] with ``v`` (nv,) [rad/s]; by default at rest at home. A start outside the limits,
+    too fast or in penetration is allowed. For the limits that the start breaks, the promise is to recover, and separate
+    margins check that. Coal measures distances between ticks and during full stops, in ticks that ``random`` chooses,
+    or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the joints move along several
+    parabolas. The reference does not contain these parabolas, so only the tick's end is checked.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Contract:
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
         """Take the ``openings`` that the controller has accepted.
 
-        ``before_step`` is False if it is known only after a step that the controller has accepted them.
+        ``before_step`` is False if the caller learns only after a step that the controller has accepted them.
         """
         if before_step:
             self._stop = self._controller.stop_deceleration
@@ -256,7 +256,7 @@ class Contract:
         return np.asarray(np.maximum(np.abs(v) - self._v_max * (1.0 + RELATIVE), 0.0))
 
     def _stops_inside(self, q: Array, v: Array) -> npt.NDArray[np.bool_]:
-        """Return which joints are inside their limits, and stay there by full braking that begins one substep late."""
+        """Return which joints are inside their limits, and stay there if full braking begins one substep later."""
         end = q + v * np.abs(v) / (2.0 * self._a) + v * self._substep
         inside = (np.minimum(q, end) >= self._lower) & (np.maximum(q, end) <= self._upper)
         return np.asarray(inside, dtype=np.bool_)

@@ -131,7 +131,7 @@ class FaultySolver:
 
 
 class PushingSolver:
-    """A solver that drives all joints as fast as the box allows, for some ``ticks`` in each of many directions."""
+    """A solver that drives all joints as fast as the box allows, for ``ticks`` ticks in each of many directions."""
 
     def __init__(self, ticks: int) -> None:
         self._random, self._ticks, self._left = np.random.default_rng(72), ticks, 0
@@ -160,7 +160,7 @@ class Segment:
     targets: str  # Name of the stream of targets.
     timing: str  # Kind of the ticks' durations.
     ticks: int  # Number of ticks.
-    start: Start | None  # The first state; None if the segment continues from the last one.
+    start: Start | None  # The first state; None if the segment continues from the previous segment.
     fault: str | None  # The fault of the solver; None if the solver works.
     fault_period: int  # The solver fails in every second period of this many ticks. An attack lasts the whole segment.
     stream: Stream

@@ -109,7 +109,7 @@ class MeasuredDistances:
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
         self._fingers: CoalDistances | None = None  # None if fingers may be anywhere between open and closed.
         objects = robot.objects.geometry.copy()
-        for pair in robot.collision_model.collisionPairs:  # Only the pairs of objects are kept.
+        for pair in robot.collision_model.collisionPairs:  # Only the pairs of held objects stay.
             objects.removeCollisionPair(pair)
         self._of_objects = CoalDistances(robot.model, objects)
         self.forget()
@@ -120,7 +120,7 @@ class MeasuredDistances:
         self.held = np.full(len(self._robot.objects.pair_names()), -np.inf)
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """Set the interval of each gripper's opening. The gripper of an arm that is not named may be anywhere."""
+        """Set the interval of each gripper's opening. Without an interval, a gripper can have any opening."""
         model = collision_model_at(self._robot.collision_model, self._robot.finger_bodies, openings)
         self._fingers = CoalDistances(self._robot.model, model)
 

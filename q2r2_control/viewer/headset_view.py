@@ -37,10 +37,13 @@ class DisplayInput(Input, Protocol):
         """
 
     def show(self, content: Any) -> bool:
-        """Show the newest state. Return False if the last state is not sent yet. The method never waits."""
+        """Show the newest state. Return False if the previous state is not sent yet. The method never waits."""
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, in the manner of :meth:`show`. Any thread may call this method."""
+        """Show the newest picture of a camera. Return False if the previous picture is not sent yet.
+
+        The method never waits. Any thread may call it.
+        """
 
 
 class HeadsetView:

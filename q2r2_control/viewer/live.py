@@ -21,7 +21,7 @@ from q2r2_control.viewer.tables import times_real_time
 from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # Rate at which the table is drawn [Hz].
-# The thread that draws may compute for milliseconds. The loop gets the interpreter back from it after this time [s].
+# The thread that draws may compute for milliseconds. After this time [s], it has to give the interpreter to the loop.
 _SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN, _BAR = 4, 20  # Greatest number of limits that are named, and length of the progress bar [characters].
 _NAMES = len("gripper opening")  # Width of the column with the names of rows. No name is longer [characters].
@@ -93,7 +93,7 @@ class LiveTable:
             yield
         finally:
             sys.setswitchinterval(before)
-            with suppress(OSError):  # The terminal may be closed.
+            with suppress(OSError):  # Printing fails if the terminal was closed.
                 live.stop()
 
     def _drawn_table(self, width: int) -> Table | str:

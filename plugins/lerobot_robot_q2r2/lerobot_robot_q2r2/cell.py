@@ -35,7 +35,7 @@ from q2r2_control.plants import CellPictures, MujocoPlant
 from q2r2_control.recording import About, DevicePictures, Recorder
 
 _logger = logging.getLogger(__name__)
-_ROOM = 64 << 20  # Size of pictures and ticks that may wait to be written [bytes].
+_ROOM = 64 << 20  # Largest total size of the pictures and ticks that wait to be written [bytes].
 # Longest time to wait for the first tick [s]. It is longer than the compilation of the kernels of a new version takes.
 _BEGINS = 60.0
 

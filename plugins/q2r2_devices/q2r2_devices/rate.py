@@ -14,8 +14,8 @@ import pinocchio as pin
 
 from q2r2_control import Array, HandInputs, HandSample
 
-# A device that is deflected sends a reading every 8 or 16 ms. If it sends none for longer than this, it is switched off
-# or out of range, and its last velocity must not count any longer [s].
+# While a device is deflected, it sends a reading every 8 or 16 ms. If no reading comes for longer than this [s], the
+# device is switched off or out of range. Its last velocity then no longer counts.
 SILENCE = 0.15
 _PERIOD = 1.0 / 90.0  # Period of the samples [s].
 _LONGEST_STEP = 0.1  # A gap between two polls counts as at most this long [s].
@@ -41,7 +41,7 @@ class RateHand:
         """Return the samples since the last poll. There are none while a deflected device is silent.
 
         Args:
-            readings: The new readings. None stands where the device was lost.
+            readings: The new readings, in order. A None among them says that the device was lost at that time.
             now: The time by the clock of the samples' stamps [s].
         """
         self._integrate(now)

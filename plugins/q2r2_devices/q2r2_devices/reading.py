@@ -18,7 +18,7 @@ tell: Say = logging.getLogger(__name__).info
 READ_TIMEOUT = 0.1  # Longest time for which ``Device.read`` waits [s].
 _RETRY = 1.0  # Time between two attempts to open a device again [s].
 # Number of successive reads that may fail. Buses of hobby servos lose single answers. A hand without a new pose moves
-# no arm, and after ``teleop.gate.timeout`` its arm stops, so nothing is gained by giving up earlier.
+# no arm, and after ``teleop.gate.timeout`` its arm stops, so it is safe to wait for further reads.
 _FAILURES = 5
 
 
@@ -30,7 +30,7 @@ class Device(Protocol[Reading]):
     """
 
     def open(self) -> str:
-        """Open the device, and return its name for people."""
+        """Open the device, and return its name for the log."""
 
     def read(self) -> Reading | None:
         """Return the next reading. Wait at most about :data:`READ_TIMEOUT`, and return None if none has come."""
@@ -40,14 +40,14 @@ class Device(Protocol[Reading]):
 
 
 class DeviceReader(Generic[Reading]):
-    """Reads one device, and opens it again after it was lost. ``name`` begins each line that is said."""
+    """Reads one device, and opens it again after it was lost. Each line that it reports begins with ``name``."""
 
     def __init__(self, name: str, device: Device[Reading], say: Say = tell) -> None:
         self.connected = False
         self._name, self._device, self._say = name, device, say
         self._readings: deque[Reading | None] = deque(maxlen=1000)
         self._stop, self._tried = Event(), Event()
-        self._fault: Exception | None = None  # Why the device could not be opened at the start.
+        self._fault: Exception | None = None  # Why the device could not be opened at the start; None if it was.
         self._thread: Thread | None = None
 
     def start(self) -> None:
@@ -65,7 +65,7 @@ class DeviceReader(Generic[Reading]):
             raise InputError(f"{self._name}: {_words(self._fault)}") from self._fault
 
     def take(self) -> list[Reading | None]:
-        """Return the readings since the last call, oldest first. None stands where it was lost."""
+        """Return the readings since the previous call, oldest first. None stands for a loss of the device."""
         return [self._readings.popleft() for _ in range(len(self._readings))]
 
     def close(self) -> None:
@@ -109,7 +109,7 @@ class DeviceReader(Generic[Reading]):
                 self._readings.append(reading)
 
     def _close_device(self) -> None:
-        with suppress(Exception):  # A device that is unplugged may not be able to close.
+        with suppress(Exception):  # Closing an unplugged device can raise an exception.
             self._device.close()
 
 
@@ -119,7 +119,7 @@ def _words(error: Exception) -> str:
 
 
 class DeviceInput:
-    """What inputs with devices have in common: all devices are opened, read and closed together."""
+    """The base class of inputs that read devices. It opens, reads and closes all its devices together."""
 
     options = ("say",)
     feels = False

@@ -1,10 +1,10 @@
 """SpaceMice of 3Dconnexion as hands: the cap gives a hand's velocity, and two buttons are the hand's buttons.
 
-The library hidapi reads the devices. It is kept by the project that keeps the C library, its wheels contain this
-library for Linux, macOS and Windows, and it names each device by path and serial number. pyspacemouse stands on a
-binding from 2017 that needs the C library from elsewhere, and gives readings without telling which of them are new.
-evdev exists only on Linux, and its kernel driver leaves out readings that did not change, so a device that is switched
-off cannot be told from one that is held still.
+The Python library hidapi reads the devices. One project maintains it and the C library that it calls. Its wheels
+contain the C library for Linux, macOS and Windows. It names each device by path and serial number. The library
+pyspacemouse is not used: it needs a binding from 2017 that does not contain the C library, and it does not tell which
+readings are new. evdev is not used, because it exists only on Linux. Also, its kernel driver leaves out readings that
+did not change. Therefore a device that is switched off looks the same as a device that is held still.
 """
 
 from __future__ import annotations
@@ -136,7 +136,9 @@ def _names(info: dict[str, Any]) -> list[str]:
 
 
 def _hidapi() -> Any:
-    """Return hidapi's module. On Linux its variant for hidraw leaves the device to the kernel, so the desktop keeps it.
+    """Return hidapi's module. On Linux, this is its variant for hidraw, which does not detach the kernel's driver.
+
+    Therefore the desktop can still use the device.
 
     Raises:
         InputError: If hidapi is not installed.

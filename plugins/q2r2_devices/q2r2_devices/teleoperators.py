@@ -2,8 +2,8 @@
 
 An arm follows its hand only while a dead man's switch is held. A gamepad or keyboard of lerobot says by itself whether
 the person intervenes. A leader arm has no button, and both hands of the person hold leaders, so a pedal is the switch.
-A gesture of the gripper's handle would be no switch: to pause by a double squeeze, the person would have to open the
-gripper, and would drop what it holds.
+A gesture of the gripper's handle cannot be the switch. To pause by a double squeeze, the person would have to open the
+handle, so the gripper would open and drop the object that it holds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from q2r2_devices.settings import settings_of
 _WHERE = "input_settings.lerobot"
 _PERIOD = 1.0 / 75.0  # Shortest time between two readings of a teleoperator [s].
 _DELTAS = ("delta_x", "delta_y", "delta_z")
-_CLOSE, _STAY = 0, 1  # Values of lerobot's action ``gripper``. 2 opens it.
+_CLOSE, _STAY = 0, 1  # Values of lerobot's action ``gripper``. The value 2 opens the gripper.
 _WORDS = DeviceWords(
     nouns={"grip": "the pedal, or the device's own button to intervene", "trigger": "the gripper's handle"},
     verbs={"grip": "hold"},
@@ -159,7 +159,7 @@ class LeaderHand:
         self._hand = hand
 
     def poll(self, readings: list[LeaderReading | None], now: float) -> list[HandSample]:
-        """Return the newest reading as a sample; none if nothing came, or if the leader was lost."""
+        """Return the newest reading as one sample. Return no sample if no reading came, or if the leader was lost."""
         newest = readings[-1] if readings else None
         if newest is None:
             return []

@@ -105,9 +105,9 @@ class FrankaCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded now, or could not be commanded at some time since the last call.
+        """Return why the arms cannot be commanded now, or could not at some time since the previous call.
 
-        Return None if they could be commanded all the time.
+        Return None if they could be commanded during all of this time.
         """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():

@@ -1,8 +1,9 @@
 """Check recorded commands against the published limits: ``python -m q2r2_franka.check FILE``.
 
-Velocities, accelerations and jerks are the differences that the robot computes: of a command, and of the positions that
-it commanded itself in the periods before. The robot drops a command that comes late, and then goes on with the last
-acceleration. Each state reports its last position, and the same motion is assumed between two states that were read.
+The robot computes velocities, accelerations and jerks as differences between a command and the positions that it
+commanded itself in the earlier periods. This check computes the same differences. The robot drops a command that comes
+late, and then goes on with its last acceleration. Each state reports the last position that the robot commanded itself.
+Between two states that were read, the check assumes that the robot moves in this way.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from q2r2_franka.record import Entry, entries_of
 from q2r2_franka.stream import robot_positions
 
 ARMS = "left", "right"
-# A share of a limit may exceed 1 by this, because a robot rounds positions to doubles. The error that the rounding
-# causes in the jerk, which is a third difference, is far smaller.
+# A share of a limit counts as a violation only if it exceeds 1 by more than this. Smaller excesses are rounding errors,
+# because a robot rounds positions to doubles. Even in the jerk, which is a third difference, these errors are far
+# smaller than this.
 _ROUNDING = 1e-3
 
 

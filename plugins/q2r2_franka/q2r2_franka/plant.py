@@ -17,14 +17,15 @@ from q2r2_franka.state import SessionState
 from q2r2_franka.stream import MEANS
 
 # The mean of n positions that are h = 1 ms apart is at most A (n^2 - 1) h^2 / 24 from the path, where A is the limit of
-# the acceleration. For a jerk limit j, pairs keep the distance for A W^2 / 4 with W = 2 A / j (robot/command_average.py
-# of q2r2_control; W is the longest of all joints). This covers the mean if j is at most this multiple of 2 A / (n h).
+# the acceleration. For a jerk limit j, the distances that pairs keep allow the mean to be A W^2 / 4 from the path. W is
+# the largest 2 A / j of all joints (robot/command_average.py of q2r2_control). This is enough if j is at most this
+# multiple of 2 A / (n h).
 _LARGEST_JERK_LIMIT = MEANS / math.sqrt((MEANS**2 - 1) / 6.0)
 _LOOKS = 0.01  # Time between two checks of the robots during a wait [s].
 
 
 class FrankaPlant:
-    """A plant of real arms. They start where they are, also after a robot has ended a motion."""
+    """A plant of real arms. Each motion starts at the present posture, even if a robot ended the previous one."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
     settings = FrankaSettings
@@ -60,7 +61,8 @@ class FrankaPlant:
         limit = config.control.jerk_limit
         kept = 2.0 * robot.capped_acceleration(config.control.acceleration_limit) / (MEANS * PERIOD)
         if limit is not None and not 1.0 <= float((limit / kept).min()) <= _LARGEST_JERK_LIMIT:
-            # The mean of positions cannot keep a smaller limit. With a larger limit, pairs would be too near.
+            # The mean of positions cannot keep a smaller limit. With a larger limit, W is shorter. The distances that
+            # pairs keep would then not allow for the whole distance of the mean from the path.
             largest = math.floor(_LARGEST_JERK_LIMIT * kept.max())
             raise ConfigError(
                 f"control.jerk_limit = {limit}: allowed with robots: {kept.max():.0f} to {largest} rad/s^3, with the "

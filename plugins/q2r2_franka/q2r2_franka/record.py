@@ -24,8 +24,8 @@ class Entry(NamedTuple):
     cycles: int
     time: float  # Time by the monotonic clock [s].
     values: Array  # Positions [rad] or torques [Nm] (7,).
-    # Positions [rad] or torques [Nm] (7,) that the robot commanded itself last, as the state reports them that this
-    # command answers.
+    # Positions [rad] or torques [Nm] (7,) that the robot itself commanded last. The state that this command answers has
+    # reported them.
     held: Array
 
 

@@ -88,8 +88,8 @@ class ArmSession:
     def has_passed(self, command: ArmCommand) -> bool:
         """Return whether ``command`` has come too late.
 
-        It has come too late if the robot already got a position for a time after the start of ``command``. This
-        position was on the earlier stop.
+        It has come too late if the robot already got a position for a time after the start of ``command``. The robot is
+        then already on the stop of the previous command.
         """
         return self.state.following and self.state.answered > command.start
 

@@ -129,7 +129,7 @@ class ArmCommand:
     """
 
     now: float  # Time of the tick by the monotonic clock [s].
-    start: float  # At this time of the reference [s], it leaves the earlier stop, and the step of this tick begins.
+    start: float  # At this time of the reference [s], it leaves the previous tick's stop, and this tick's step begins.
     end: float  # At this time of the reference [s], the step of this tick ends.
     q: Joints  # Posture at the time ``end`` [rad].
     v: Joints  # Velocity at the time ``end`` [rad/s].

@@ -14,8 +14,9 @@ overview of libfranka's documentation). From this position, the stream finds out
 command. The difference between the robot and the path then goes to zero by a polynomial of fifth degree. The polynomial
 begins with the position, velocity and acceleration that the difference has at that time.
 
-**A wrong answer to that question** has a small effect. A single lost command leaves the robot at most j (1 ms)^3 from
-the mean. The next difference then has a jerk of at most 4 j, which n = 8 keeps below the limit of 5,000 rad/s^3.
+**Errors.** The stream can be wrong about whether the robot took the last command. Such an error has a small effect. A
+single lost command leaves the robot at most j (1 ms)^3 from the mean. The next difference then has a jerk of at most
+4 j, which n = 8 keeps below the limit of 5,000 rad/s^3.
 """
 
 from __future__ import annotations
@@ -96,7 +97,8 @@ def robot_positions(before: list[Array], sent: Array, periods: int, held: Array)
     Args:
         before: Its last three positions before the last command (7,) [rad].
         sent: The last command (7,) [rad].
-        periods: Number of periods since then. The robot got at most the last command, in the first of them.
+        periods: Number of periods since the last command was sent. In the first of them, the robot either took the last
+            command or dropped it. In the other periods, it got no command.
         held: The last position that the robot reports (7,) [rad].
     """
     if periods == 1 and np.array_equal(sent, held):
@@ -109,7 +111,7 @@ def robot_positions(before: list[Array], sent: Array, periods: int, held: Array)
 def _continued(positions: list[Array], periods: int) -> list[Array]:
     """Return the robot's last three positions after ``periods`` without a command, in which it goes on by itself.
 
-    It keeps its last acceleration. ``positions`` are its three positions before (7,) [rad].
+    It keeps its last acceleration. ``positions`` are its three positions before these periods (7,) [rad].
     """
     for _ in range(periods):
         oldest, before, newest = positions
@@ -128,8 +130,8 @@ class TorqueStream:
         """Return the torques to send now (7,) [Nm]: as near to ``wanted`` as the limits allow.
 
         The torque may change only by the limit of one period, even after periods without a command, because the robot
-        keeps the last torque that it took. A late command is dropped, so this torque may be an earlier one than the
-        last command. The result therefore differs by at most one change from both of them.
+        keeps the last torque that it took. The robot drops a late command, so ``held`` can be older than the last
+        command. The result therefore differs by at most one change from ``held``, and from the last command.
 
         Args:
             wanted: The torques of the impedance (7,) [Nm].

@@ -98,7 +98,7 @@ def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchCo
         try:
             peers.append(make_peer(name, setup))
             notes.append(f"{name}: {peers[-1].limitations}")
-        except Exception as error:  # Another version of a package may raise anything.
+        except Exception as error:  # Another version of a package can raise any exception.
             notes.append(f"{name}: cannot be built for this cell: {type(error).__name__}: {error}")
     return peers, notes
 

@@ -17,9 +17,9 @@ from websockets.asyncio.server import ServerConnection
 from q2r2_control.inputs.listener import RateLimit
 
 LONGEST_MESSAGE = 4096  # Allowed length [bytes]. The page's longest message, about its camera, has 400 bytes.
-MOST_MESSAGES = 1000  # Allowed messages of a browser per second. A browser that drags both tools sends 160.
+MOST_MESSAGES = 1000  # Allowed messages of a browser per second. A browser that drags both tools sends 160 per second.
 _PRESS_PERIOD = 0.1  # A second press of a button within this time is ignored [s].
-_CHANGES = 10  # Allowed changes of a slider or a checkbox within ``_PRESS_PERIOD``. A browser sends 2.
+_CHANGES = 10  # Allowed changes of a slider or a checkbox within ``_PRESS_PERIOD``. A browser sends 2 changes.
 _FLOOD = 1008  # Code of WebSocket for a connection that is closed because a client broke a rule.
 
 _Three = tuple[float, float, float]

@@ -77,7 +77,7 @@ class Door(PageDoor):
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    # No other page may embed this page. It could deceive the user into clicking this page's buttons.
+                    # No other page may embed this page. A user could then be tricked into clicking its buttons.
                     response.headers["X-Frame-Options"] = "DENY"
                 return response
 

@@ -133,7 +133,7 @@ class Page:
         return self._process.fault
 
     def send(self, frame: Frame) -> bool:
-        """Show a frame. Return False, and show nothing, if the page is still busy with the last frame."""
+        """Show a frame. Return False, and show nothing, if the page is still busy with the previous frame."""
         pictures, self._pictures = self._pictures, {}
         sent = self._process.send(replace(frame, pictures=pictures) if pictures else frame, 1)
         if not sent:

@@ -45,7 +45,7 @@ class PageView(Page):
     """Shows one run on a page: a listener of the run, and a context around it. No browser can keep the loop waiting.
 
     At each tick, references to the newest data are stored. 30 times a second, a thread of the page sends them to the
-    page's process. If this thread is still busy with the last data, it sends newer data later. If the page fails, one
+    page's process. If this thread is still busy with earlier data, it sends newer data later. If the page fails, one
     line is logged and the run goes on.
     """
 
@@ -110,7 +110,8 @@ class PageView(Page):
             self._on_request = on_request
         config, plant = pipeline.config, pipeline.plant
         source: object = pipeline.input
-        while (operator := getattr(source, "operator", None)) is not None:  # A policy's input may have an operator.
+        # The input of a policy can contain the input of an operator.
+        while (operator := getattr(source, "operator", None)) is not None:
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
@@ -204,7 +205,7 @@ class PageView(Page):
 def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:
     """Return a function for each slider, which gets the slider's value.
 
-    Speeds stay within the cell's speeds. A value that is not allowed changes nothing.
+    A slider cannot set a speed above the cell's own speed. A value that is not allowed changes nothing.
     """
     control, teleop, impedance = pipeline.config.control, pipeline.config.teleop, pipeline.config.impedance
 
