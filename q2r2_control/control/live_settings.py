@@ -23,8 +23,8 @@ less. The known stop is then certified with the object too, so that the object n
 distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
 it is assumed that both hands hold the same object. Its two bodies are not kept apart until one hand releases it.
 
-**Gains** and weights change linearly to their new values. These are all arrays of the tasks that differ between the old
-and the new settings, and the gain of the separation rows. The certificate does not depend on them.
+**Gains** and weights change linearly to their new values. All arrays of the tasks that differ between the old and the
+new settings change in this way, and so does the gain of the separation rows. The certificate does not depend on them.
 """
 
 from __future__ import annotations
@@ -97,10 +97,13 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count keep as much distance as is certified. Measure them before."""
+        """Let pairs that have begun to count keep as much distance as is certified.
+
+        The pairs have to be measured before this call.
+        """
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
-        if (overlap & self._shared & self._new).any():  # Both hands hold one object.
+        if (overlap & self._shared & self._new).any():  # Both grippers hold the same object.
             kept[self._shared] = -np.inf
         self._write(kept)
         self._due = 0.0

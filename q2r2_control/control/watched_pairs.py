@@ -111,7 +111,7 @@ class WatchedPairs:
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
+        self._active.used[0] = 0  # Pairs that were active in the last step may no longer be monitored.
         self._obstacles.hold(self._objects.holding)
         self._observe_again(self._unchanged)
         self._objects.begin()
@@ -145,7 +145,7 @@ class WatchedPairs:
             ConfigError: If there is no such name.
         """
         changed = self._obstacles.put(name, obstacle)
-        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
+        self._active.used[0] = 0  # Pairs that were active in the last step may no longer be monitored.
         blocked = self._observe_again(changed) if self._state.v.any() else -1
         self._certified &= blocked < 0
         self._obstacles.keep_clear(0.0)

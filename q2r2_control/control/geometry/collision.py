@@ -47,7 +47,7 @@ class Pairs(NamedTuple):
     # (p, k) Bound on the distance of the geometry's points from the joint's axis [m]; 1 for a sliding joint.
     reach: Array
     leverage: Array  # (p,) Sum of ``reach`` over the joints.
-    carried: IntArray  # (p,) 1 if some joint moves both geometries alike. Such a joint is not listed.
+    carried: IntArray  # (p,) 1 if some joint moves both geometries alike. Such a joint is not listed in ``joint``.
 
 
 class CollisionModel(NamedTuple):

@@ -53,7 +53,7 @@ def apply_safety_filter(
     if usable:
         total = 0.0
         for j in range(q.shape[0]):
-            # The solution may leave the box by the solver's tolerance. NaN may pass a clamp, but the sum is then NaN.
+            # The solution may leave the box by the solver's tolerance. NaN may pass a clamp, but ``total`` is then NaN.
             total += solution[j]
             data.wanted[j] = clamp(solution[j], data.box.lower[j], data.box.upper[j])
             total += data.wanted[j]
@@ -270,7 +270,8 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
         if far and distance[p] > always + horizon * fastest:
             continue  # ``fastest`` bounds the approach speed of any two bodies, so this pair needs no measurement.
         first, second = pairs.first[p], pairs.second[p]
-        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # Either arm may stop alone.
+        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:
+            # One arm may stop while the other arm moves, so the speeds of both bodies are added.
             approach_speed = speed_of(data.velocities, first) + speed_of(data.velocities, second)
         else:
             approach_speed = fastest_approach(data.velocities, first, second)
