@@ -6,9 +6,9 @@ none with the fingers of other hands, because these must be able to take the obj
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
 taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
-them until one of them meets an edge. When two polyhedra begin to overlap, an edge of one of them enters the other one.
-The distance of two boxes is therefore the least distance of the twelve edges of each box from the other box. Each edge
-is a capsule without a radius.
+the faces until one of the points meets an edge. When two polyhedra begin to overlap, an edge of one of them enters the
+other one. The distance of two boxes is therefore the least distance of the twelve edges of each box from the other box.
+Each edge is a capsule without a radius.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class HeldObjects:
 
     geometry: pin.GeometryModel  # ``Robot.collision_model``, followed by the bodies and pairs of objects.
     by_arm: dict[str, HeldObject]
-    # For each of the objects' pairs, the arms that have to hold their objects. Otherwise the pair does not count.
+    # For each of the objects' pairs, the arms that have to hold their objects so that the pair counts.
     holders: tuple[frozenset[str], ...]
 
     def pair_names(self) -> tuple[tuple[str, str], ...]:

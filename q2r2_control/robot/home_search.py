@@ -33,7 +33,8 @@ _AHEAD = np.array([0.8, 0.0, -0.6])  # Wanted direction in which the tool points
 _LEAST_GAIN = 0.15
 _BORNE = 0.7  # Share of the torque limits that gravity may require.
 _ROOM = 0.04  # Wanted distance of a pair in addition to the distance that it keeps [m].
-_BELOW = 0.16  # Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less.
+# Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less than this.
+_BELOW = 0.16
 _NEEDED = 0.005  # Required additional distance [m].
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # Points on two axes of the tool's frame [m].

@@ -12,13 +12,13 @@ interpolation between both ends of the step has an error of at most an eighth of
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 
 because the second derivative by two turning joints is a product of rotations about both axes with the lever of the
-outer joint. Here r bounds the distance of x from the axis of a joint. For a joint that slides, r = 1 if it is the outer
-one of two joints, and r = 0 if it is the inner one or both. Several driven joints in one chain are interpolated one
-after the other. Each interpolation takes means of the values of the interpolation before it. The errors therefore add
-up, and derivatives by two different driven joints do not count. Interpolated points lie in the hull of the samples. A
-capsule is convex. If it encloses each sample with the shape's radius and that remainder, it encloses all points. For
-any segment, this radius is the distance of the farthest sample from the segment, plus the shape's radius and the
-remainder. []
+outer joint. Here r bounds the distance of x from the axis of a joint. If the outer joint slides and the inner joint
+turns, r = 1. If the inner joint slides, or if i and k are the same sliding joint, r = 0. Several driven joints in one
+chain are interpolated one after the other. Each interpolation takes means of the values of the interpolation before it.
+The errors therefore add up, and derivatives by two different driven joints do not count. Interpolated points lie in the
+hull of the samples. A capsule is convex. If it encloses each sample with the shape's radius and that remainder, it
+encloses all points. For any segment, this radius is the distance of the farthest sample from the segment, plus the
+shape's radius and the remainder. []
 
 The choice of the segment affects only the size of the capsule. Some candidates lie along the shape and some along the
 path of its middle. The candidate with the least mean width is taken. Capsules of nested intervals are not nested: the
