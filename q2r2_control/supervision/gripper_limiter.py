@@ -112,7 +112,7 @@ class _Gripper:
         self._since = -math.inf
 
     def rests(self, wanted: float, measured: float, now: float) -> bool:
-        """Return whether a tick brings nothing new, as most ticks do.
+        """Return whether a tick brings no new information, which is so in most ticks.
 
         The wanted opening is then commanded already, and the measured opening lies in the interval seen so far.
         """

@@ -73,7 +73,7 @@ class JointWatch:
         self._source = source  # Text that names the sender in messages, such as " from /node", or "".
         self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
-        self._lost = False  # True if the fault is that of :meth:`lose`, and all states since then were good.
+        self._lost = False  # True if :meth:`lose` has recorded the fault, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None

@@ -31,7 +31,7 @@ WINDOW = 0.05  # Length W of the window [s].
 _STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded distance.
 _FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded distance.
 _LOOK_PERIOD = 0.0075  # Least time between two checks; the loop may tick more often [s].
-_STATE_GAP = 0.045  # After a longer gap between two states the window begins again [s].
+_STATE_GAP = 0.045  # If the gap between two states is longer than this, the window begins again [s].
 
 
 @dataclass(frozen=True, slots=True)

@@ -185,7 +185,7 @@ class TargetStreams:
             stream.reset()
 
     def expire(self, now: float) -> list[Reason]:
-        """End the streams whose targets have ceased. Return the reasons of all ends since the last call."""
+        """End the streams whose targets have ceased. Return a reason for each stream that has newly ended."""
         for arm in self._streams:
             self._expire(arm, now)
         ended, self._newly_ended = self._newly_ended, []

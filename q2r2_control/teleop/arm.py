@@ -21,7 +21,7 @@ from q2r2_control.types import Array, HandInputs, HandSample, Pose
 
 # The next three numbers are shares of a trigger's travel.
 _SLACK = 0.05  # The first and the last part of the travel have no effect, since not every trigger reaches its ends.
-_HYSTERESIS = 0.02  # A smaller motion of the trigger counts as tremor and changes nothing.
+_HYSTERESIS = 0.02  # If the trigger moves by less than this, the motion counts as tremor and changes nothing.
 _PICK_UP = 0.05  # The trigger begins to move the gripper when it is this near to the gripper's opening.
 
 

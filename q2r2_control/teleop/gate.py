@@ -17,7 +17,7 @@ from q2r2_control.types import HandSample, Pose
 _MAX_COORDINATE = 1e6  # No tracking system measures such a large coordinate [m].
 _QUATERNION_LENGTHS = (1e-6, 1e6)  # A quaternion with a length outside this range counts as no rotation.
 # Least time over which a speed is measured [s]. Messages that a network has delayed arrive less than 1 ms apart. A
-# speed between two of them would mean nothing.
+# speed that is computed from two such messages would be far too high.
 _SPEED_WINDOW = 0.05
 
 
