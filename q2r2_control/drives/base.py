@@ -176,7 +176,7 @@ class PositionDrive(Drive):
 class VelocityDrive(PositionDrive):
     """Commands v = v_ref + k (q_ref - q) within the limits: the reference's velocity, and feedback of the position.
 
-    If the state is not trusted or some ticks old, v is v_ref, without feedback.
+    If the state is not trusted, not finite, or more than ``_FRESH_TICKS`` ticks old, v is v_ref, without feedback.
     """
 
     mode = CommandMode.VELOCITY

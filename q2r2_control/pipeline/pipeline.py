@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 STOPPING = "stopping"  # The state of every arm while the run ends.
 _STOP_ALLOWANCE_S = 1.0  # Further time, after full braking, for an arm that still has to return into its limits.
-_REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
+_REST = 1e-6  # The reference is at rest if no joint is faster than this [rad/s].
 _ROUNDING_S = 1e-9
 # Longest time for which a simulated plant executes one torque, unless a period is longer. If a late tick let it execute
 # a torque for 0.1 s, the torque would drive the arms into each other.
@@ -189,10 +189,10 @@ class Pipeline(RequestedRun):
 
         Args:
             duration: Length of the run [s]; None if only a stop ends it.
-            realtime: True if the loop follows the clock, and a late tick moves no joint farther than a period allows.
-                False if time is simulated, which makes the run repeatable.
-            paced: True if simulated time must not pass faster than the clock. On a slow computer it passes more slowly.
-                The result is the same, bit for bit.
+            realtime: True if the ticks follow the computer's clock. A late tick then moves no joint farther than the
+                velocity limits allow in one period. False if time is simulated, which makes the run repeatable.
+            paced: True if simulated time must not pass faster than the computer's clock. On a slow computer it passes
+                more slowly. The result is the same as without ``paced``, bit for bit.
 
         Raises:
             ConfigError: If the duration is not positive, or if the plant does not support this kind of time.

@@ -53,7 +53,7 @@ class RequestedRun:
 
     @property
     def impedance(self) -> ImpedanceController | None:
-        """The impedance, which exists only in torque mode."""
+        """The impedance controller of the drive; None if the mode is not torque."""
         return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:

@@ -117,7 +117,7 @@ class SlowRun:
         self._end_run()
 
     def _end_run(self) -> None:
-        with stop_on_signals(self._pipeline.stop):  # A signal brings the arms to rest first.
+        with stop_on_signals(self._pipeline.stop):  # A signal does not interrupt the stop of the arms.
             self._pipeline.stop()
             self._thread.join()
 
