@@ -108,7 +108,7 @@ class ImpedanceController:
         self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
-        """Start again at rest at the measured posture. The first torque is the gravity torque there.
+        """Start again at rest at the measured posture. The first torque is the gravity torque at this posture.
 
         Changes of stiffness, damping or payload that have not ended yet are completed at once.
 

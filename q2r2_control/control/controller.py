@@ -319,7 +319,7 @@ class CartesianController(WatchedPairs):
         return self._reference(StepSummary(), usable)
 
     def _remember(self) -> None:
-        """Remember the state to which :meth:`withdraw` returns, and the distances that pairs keep there."""
+        """Remember the state to which :meth:`withdraw` returns, and the distances that pairs keep in this state."""
         self._kept_before = self._live.kept, self._objects.kept
         for kept, array in zip(self._before, self._restored, strict=True):
             kept[:] = array

@@ -209,7 +209,7 @@ class LiveSettings:
     def step(self, h: float) -> None:
         """Change kept distances and gains before a step of ``h`` [s].
 
-        The distances at the reference have to be computed before.
+        The distances at the reference have to be computed before this call.
         """
         if self._objects.growing:
             self._objects.step(h)

@@ -150,7 +150,7 @@ class ControlLoop:
         """Activate the arms at once, because the caller knows that they are at rest at ``state``.
 
         Raises:
-            Q2R2Error: If the controller cannot start there.
+            Q2R2Error: If the controller cannot start at ``state``.
         """
         self.supervisor.activate(replace(state, stamp=now), now)
         self._begin(state, {}, now)
@@ -277,7 +277,7 @@ class ControlLoop:
     def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
         """Let grippers and drive begin at ``state``, where the controller was reset.
 
-        Grippers still count as holding the objects that they held before.
+        Grippers still count as holding the objects that they held before the reset.
         """
         self._grasps.tell_again()
         self._limiter = GripperLimiter(self.controller, self._delay)

@@ -210,7 +210,7 @@ class Robot:
 
         Movable joints behind the last joint of an arm count as joints of its fingers. The links to which these joints
         are attached, and all links behind them, are the arm's tool. No link counts as an obstacle. A warning names
-        pairs that would block the arm at home, and pairs that overlap only there.
+        pairs that would block the arm at home, and pairs that overlap only at home.
 
         Args:
             path_or_xml: The URDF as a file or a text.

@@ -88,7 +88,7 @@ class JointHoming:
             if float(np.abs(v).max()) > _AT_REST:
                 return HomingStep(None, {})
             self._distances, kept = self._look()
-            # A pair that is closer than this distance at the start of the path may stay as close as it is there.
+            # If a pair is closer than ``kept + _EXTRA_DISTANCE`` at the start, it may stay as close as at the start.
             self._needed = np.minimum(kept + _EXTRA_DISTANCE, self._distances(q) - 1e-4)
             self._at = self._leg = q.copy()
             self._search = self._check_paths(self._at)

@@ -159,7 +159,7 @@ class JointWatch:
         self.fault, self._near_at, self._lost = None, None, False
 
     def accept_at_once(self, state: RobotState, now: float) -> None:
-        """Accept ``state`` without waiting, because the caller knows that the arms are at rest there."""
+        """Accept ``state`` without waiting, because the caller knows that the arms are at rest in it."""
         self.state, self._q = state, state.q.tolist()
         self._still_since, self._still_at = now, self._q
         self.accept()
@@ -256,7 +256,7 @@ class ExternalArms:
     def targets(self, wanted: dict[str, pin.SE3 | None], last: Reference | None) -> dict[str, pin.SE3 | None]:
         """Return the ``wanted`` targets, by arm.
 
-        If an arm has no target and rests in the ``last`` reference, its target is the tool's pose there.
+        If an arm has no target and rests in the ``last`` reference, its target is the tool's pose in this reference.
         """
         for arm, pose in wanted.items():
             if pose is not None:

@@ -60,7 +60,7 @@ _ALONE = 1.0  # A break in the sequence counts as recent for this time [s].
 class SequenceWatch:
     """Finds a second publisher by the sequence numbers of one topic. All times are times of receipt [s].
 
-    A break in the sequence is a number that cannot come from the publisher of the number before.
+    A break in the sequence is a number that cannot come from the publisher of the previous number.
     """
 
     def __init__(self) -> None:

@@ -102,7 +102,7 @@ class ArmTeleop:
 
         Args:
             settings: The new settings.
-            last: The last target in the world frame. An engaged arm is anchored there, so that it does not jump.
+            last: The last target in the world frame. An engaged arm is anchored at it, so that it does not jump.
             now: The time [s].
         """
         if of_controls(settings) != of_controls(self._settings):
@@ -160,7 +160,7 @@ class ArmTeleop:
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
     def take_presses(self, now: float) -> list[Press]:
-        """Return the gestures since the last call. The caller passes them to :meth:`act`, or drops them."""
+        """Return the gestures since the previous call. The caller passes them to :meth:`act`, or drops them."""
         presses, self._presses = self._presses + self._gestures.due(now), []
         if (stuck := self._gestures.take_stuck(now)) is not None:
             self.record_event(now, Reason(TeleopReason.NOT_ENGAGED, cause=stuck))

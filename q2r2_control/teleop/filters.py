@@ -76,7 +76,7 @@ class Interpolator:
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
         """Return the position [m] and the rotation at ``now`` [s].
 
-        The third value is the rotation vector from the last call's rotation to this call's rotation [rad].
+        The third value is the rotation vector from the previous call's rotation to this call's rotation [rad].
 
         ``now`` must not go back.
         """
@@ -172,7 +172,7 @@ class PoseFilter:
         self._interpolator.add(*pose, stamp, now)
 
     def at(self, now: float) -> Pose:
-        """Return the filtered pose at ``now`` [s]; the last pose if ``now`` is not after the last call."""
+        """Return the filtered pose at ``now`` [s]; the last pose if ``now`` is not later than in the previous call."""
         dt = now - self._now
         if dt <= 0.0:
             return self._out

@@ -52,9 +52,9 @@ class PoseGate:
         """Judge the pose of a sample.
 
         Returns:
-            True if the pose is new and usable, so that an arm may be anchored to it; and the reason why an engaged arm
-            must not follow it, or None. After a jump the pose is usable and there is a reason: the arm must not follow
-            the jump, but may be anchored to the new pose.
+            Two values. The first is True if the pose is new and usable, so that an arm may be anchored to it. The
+            second is the reason why an engaged arm must not follow the pose, or None. After a jump the pose is usable
+            and there is a reason: the arm must not follow the jump, but may be anchored to the new pose.
         """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):

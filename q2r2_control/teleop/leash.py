@@ -222,7 +222,7 @@ class Workspace:
     def hold(self, target: Pose) -> Vector | None:
         """Return the permitted position nearest to ``target`` (world frame) [m]; None if ``target`` is permitted.
 
-        The caller anchors the motion there.
+        The caller anchors the motion at this position.
         """
         asked = target[0]
         if self._bounds is None:

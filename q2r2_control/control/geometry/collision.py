@@ -81,7 +81,7 @@ class Contact(NamedTuple):
 
 
 class CollisionData(NamedTuple):
-    """Poses of joints and bodies at a posture, written by :func:`update_placements`, and the last measurement there."""
+    """Poses of joints and bodies, written by :func:`update_placements`, and the last measurement at this posture."""
 
     placements: Placements
     posed: BodyPlacements

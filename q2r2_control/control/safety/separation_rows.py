@@ -73,8 +73,8 @@ _CATCH_UP = 50.0
 def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> None:
     """Write the rows that can bind in a step of ``h`` [s]. Each row has unit norm.
 
-    The pairs have to be measured at the reference before. The candidate and its rollout are overwritten with the
-    certified stop.
+    The pairs have to be measured at the reference before this call. The candidate and its rollout are overwritten
+    with the certified stop.
     """
     stay_with_stop(data)
     duration = begin_rollout(data)
