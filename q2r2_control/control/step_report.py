@@ -64,7 +64,7 @@ class StepSummary:
     unsolved: int = 0  # Bit i is 1 if substep i had no solution.
     slack: float = 0.0
     solve_time: float = 0.0
-    faults: tuple[str, ...] = ()  # As in StepReport.
+    faults: tuple[str, ...] = ()  # See :class:`StepReport`.
     constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that were active in the last substep.
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:

@@ -263,7 +263,7 @@ class TorqueDrive(Drive):
         return Command(self.mode, reference.q, reference.v, torque.tau, grippers)
 
     def at_rest(self, state: RobotState) -> bool:
-        # Without a measurement, waiting for rest would never end.
+        # If the measurement is not finite, the arms count as at rest. Otherwise the caller would wait for ever.
         seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
         return not seen or float(np.abs(state.v).max()) <= _STILL
 

@@ -423,7 +423,7 @@ class Pipeline(RequestedRun):
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
-        assert step.reference is not None  # A pipeline commands its plant in every tick.
+        assert step.reference is not None  # In a pipeline, every tick has a reference and a command.
         assert step.command is not None
         self.plant.apply(step.command)
         withdrawn = self._sessions is not None and self._sessions.withdraws()

@@ -2,9 +2,9 @@
 
 A good home has joints near the middle of their ranges. The tool is before and below the shoulder, points forwards and
 down, and can move in all directions. Gravity requires clearly less torque than the joints' limits. The bodies are
-clearly farther apart than the distances that they keep, most of all below the tool, because the tool works below its
-home position. Two conditions are required: gravity is within the torque limits, and every pair is slightly farther
-apart than its kept distance. If a posture violates one of them, its cost jumps.
+clearly farther apart than the distances that they keep. The additional distance is greatest below the tool, because the
+tool works below its home position. Two conditions are required: gravity is within the torque limits, and every pair is
+slightly farther apart than its kept distance. If a posture violates one of them, its cost jumps.
 """
 
 from __future__ import annotations

@@ -230,7 +230,7 @@ class TurningSweeps:
 def sticks_out(inner: Capsules, outer: Capsules) -> Array:
     """Return for each capsule of ``inner`` whether it is not within the capsule of ``outer`` (b,).
 
-    A capsule is the hull of the balls at its ends. It is within another one exactly if both balls are.
+    A capsule is the hull of the balls at its ends. It is within another capsule exactly if both of its balls are.
     """
     points = np.stack([inner.start, inner.end], axis=1)
     farthest = _farthest(points, outer.start[:, None], outer.end[:, None])[:, 0]

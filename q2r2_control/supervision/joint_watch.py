@@ -188,7 +188,7 @@ class JointWatch:
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
         # The first fault is kept, because it says most about the cause. Before the first good state, the newest fault
-        # says most, and replaces it.
+        # says most, and replaces the earlier fault.
         if self.fault is None or self.state is None:
             self.fault = fault
 

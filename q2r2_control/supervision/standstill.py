@@ -1,9 +1,9 @@
-"""Find a controller that stands still: it is asked for motion, and the measured arm does not move.
+"""Find a controller that stands still: its commands change, but the measured arm does not move.
 
 A controller whose process is frozen is still in the ROS graph, and its middleware still acknowledges messages. The
 joint states come from another process and go on. Meanwhile the reference moves away from the arm. When the controller
-wakes up, its newest command is a jump. An arm that only lags moves as fast as it was asked to a little earlier. An arm
-whose controller stands still does not move at all, which shows within a few states:
+wakes up, its newest command is a jump. An arm that only lags moves at the speed that was commanded a little earlier. An
+arm whose controller stands still does not move at all, which shows within a few states:
 
     path of m in W <= 0.1 |r(t) - r(t - W)|,  |r(t) - r(t - W)| >= least,  |r(t - W) - m(t)| >= ahead.
 

@@ -121,7 +121,7 @@ class ArmTeleop:
     def receive(self, sample: HandSample, now: float) -> Reason | None:
         """Process one sample of this arm's hand; returns the fault for which the arm must stop, or None."""
         stamp = min(sample.inputs_stamp, now)
-        if -math.inf < stamp and self._inputs_stamp <= stamp:  # An older reading, overtaken by a newer one, is ignored.
+        if -math.inf < stamp and self._inputs_stamp <= stamp:  # A reading that is older than the last one is ignored.
             self._inputs_stamp, self.heard_of = stamp, True
             self._presses += self._gestures.receive(sample.inputs, stamp)
             before = self._held.actions

@@ -37,7 +37,7 @@ class PoseGate:
         self.pose: Pose | None = None
         self.stamp = -math.inf  # Time of the newest pose, usable or not [s].
         self._problem: Reason | None = None
-        self._recent: deque[tuple[float, Pose]] = deque()  # Times [s] and poses, the first one about _SPEED_WINDOW old.
+        self._recent: deque[tuple[float, Pose]] = deque()  # Times [s] and poses. The oldest is about _SPEED_WINDOW old.
 
     @property
     def problem(self) -> Reason | None:

@@ -107,7 +107,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated, because growth can be refused.
+            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated: to refuse growth does no harm.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
@@ -138,8 +138,8 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
         return FOLLOWED
     unproven = data.unproven[0]
     if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
-        # No mixture is tried, because from rest a smaller motion would bring the pair closer too, and trying takes
-        # long.
+        # From rest, a smaller motion would bring the pair closer too. No mixture is tried, because this would only take
+        # time.
         return STOPPED
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):

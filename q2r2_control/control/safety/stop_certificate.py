@@ -69,7 +69,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     for p in range(data.distance.shape[0]):
         if data.distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
             continue  # No joint travels farther than ``farthest``, so the pair keeps its distance.
-        alone = apart and model.of_two_arms[p] == 1  # Each of the two arms may be anywhere on its path.
+        alone = apart and model.of_two_arms[p] == 1  # Then each of the two arms can be anywhere on its path.
         if is_far(model, data, p, time) if alone else _has_room(model, data, p, time):
             continue
         data.unproven[0] = p
