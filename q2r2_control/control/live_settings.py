@@ -21,7 +21,8 @@ buffer of this pair then grows with d - S as above. Arms that rest within the bu
 infinity. When an object is gripped, each of its pairs keeps d - S - buffer, or the distance of its class if that is
 less. The known stop is then certified with the object too, so that the object never has to be refused. The kept
 distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
-it is assumed that both hands hold the same object. Its two bodies are not kept apart until one hand releases it.
+it is assumed that both grippers hold the same object. Its two bodies are not kept apart until one of the grippers
+releases it.
 
 **Gains** and weights change linearly to their new values. All arrays of the tasks that differ between the old and the
 new settings change in this way, and so does the gain of the separation rows. The certificate does not depend on them.

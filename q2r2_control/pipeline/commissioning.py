@@ -29,7 +29,7 @@ _STANDS = 1e-3  # Joints nearer than this to their final positions count as rest
 
 @dataclass(frozen=True, slots=True)
 class JointMotion:
-    """The motion of a joint that was commanded a degree away and back."""
+    """The motion of a joint that was commanded to move by one degree and back."""
 
     joint: str
     commanded_deg: float  # Commanded motion away from the first posture.

@@ -76,7 +76,8 @@ class Mounted(NamedTuple):
 
     model: Model
     joint: ET.Element  # The joint between this flange or tool and the part before it.
-    is_flat: bool  # True if it sits flat on the part before it. An SRDF may then exclude pairs between both parts.
+    # True if this part lies flat on the part before it. An SRDF may then exclude pairs between both parts.
+    is_flat: bool
 
 
 class ArmAssembly:

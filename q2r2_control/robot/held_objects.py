@@ -1,8 +1,8 @@
 """Held objects: bodies that are fixed to the tools, and the monitored pairs with them.
 
 The objects are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the
-same bodies as the link to which it is fixed, and with all obstacles. It has no pairs with the hand that holds it, and
-none with the fingers of other hands, because these must be able to take the object over.
+same bodies as the link to which it is fixed, and with all obstacles. It has no pairs with the gripper that holds it,
+and none with the fingers of other grippers, because these must be able to take the object over.
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
 taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
@@ -130,9 +130,9 @@ class _Pairs:
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
-    """Return the bodies with which the object has pairs. The hand that holds it and all fingers are left out."""
+    """Return the bodies with which the object has pairs. The gripper that holds it and all fingers are left out."""
     items = geometry.geometryObjects
-    # All obstacles count, also those that the hand itself cannot reach, because an object reaches farther.
+    # All obstacles count, also those that the gripper itself cannot reach, because an object reaches farther.
     found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)
     for pair in geometry.collisionPairs:
         first, second = items[pair.first], items[pair.second]

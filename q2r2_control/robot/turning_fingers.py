@@ -51,7 +51,7 @@ _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 @dataclass(frozen=True, slots=True)
 class FingerJoint:
-    """A joint that moves a shape, in the frame of the arm's link to which the hand is fixed.
+    """A joint that moves a shape, in the frame of the arm's link to which the gripper is fixed.
 
     The shape was drawn at the position ``home``. The positions of all joints with one driver are linear functions of
     the driver's position, also beyond the stroke. All positions are in [m or rad].
@@ -78,7 +78,7 @@ class FingerJoint:
 
 
 class Capsules(NamedTuple):
-    """One capsule for each of b bodies, in the frame of the link to which the hand is fixed."""
+    """One capsule for each of b bodies, in the frame of the link to which the gripper is fixed."""
 
     start: Array  # (b, 3) [m]
     end: Array  # (b, 3) [m]
@@ -93,7 +93,7 @@ class TurningBody:
     name: str  # Name of the geometry object.
     ends: Array  # Both ends of its segment as drawn (2, 3) [m].
     radius: float  # Radius as drawn [m]. A capsule around it has at least this radius.
-    joints: tuple[FingerJoint, ...]  # The joints that move it, from the hand outwards.
+    joints: tuple[FingerJoint, ...]  # The joints that move it, from the base of the gripper outwards.
 
     def curvatures(self) -> Array:
         """Return a bound (j, j) [m] on the second derivatives of a shape's points by the positions of two joints.
