@@ -63,7 +63,7 @@ class SampledTargets:
 
         Returns:
             True if the sample is used. False if the pose is not finite or its matrix is not a rotation; the arm then
-            goes on to its last sample.
+            moves on to its last sample.
 
         Raises:
             RobotError: If the arm does not exist, ``pose`` is not a pinocchio.SE3, or the time is not finite.

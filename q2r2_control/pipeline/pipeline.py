@@ -178,7 +178,7 @@ class Pipeline(RequestedRun):
         return preflight_faults(self.robot, self.config.control.without_contact(), self.controller)
 
     def stop(self) -> None:
-        """Bring the arms to rest and end the run. If no run goes on, end the next run when it begins.
+        """Bring the arms to rest and end the run. If there is no run now, end the next run when it begins.
 
         Any thread and any signal handler may call this method.
         """

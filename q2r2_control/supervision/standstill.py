@@ -1,7 +1,7 @@
 """Find a controller that stands still: its commands change, but the measured arm does not move.
 
 A controller whose process is frozen is still in the ROS graph, and its middleware still acknowledges messages. The
-joint states come from another process and go on. Meanwhile the reference moves away from the arm. When the controller
+joint states still come, from another process. Meanwhile the reference moves away from the arm. When the controller
 wakes up, its newest command is a jump. An arm that only lags moves at the speed that was commanded a little earlier. An
 arm whose controller stands still does not move at all, which shows within a few states:
 

@@ -6,7 +6,7 @@ The rows tell the QP what the certified stop can do. Let B be the least free dis
 
 A step may use up only a share of B: B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function that is built
 from a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). A motion during which the pair's distance stays the same
-uses up nothing and is not slowed. A motion that brings the pair closer is slowed in time for the stop. The rows are
+uses up nothing and is not slowed. A motion that brings the pair closer is slowed early enough. The rows are
 linearised at those instants of the stop at which the free distance is least, or may soon be least, so that rows do not
 appear and disappear from tick to tick. At an instant with more free distance than B, the step may also use up the
 difference, at a rate of 50 /s.
