@@ -28,7 +28,7 @@ _METRES = np.array([1.0, 1.0, 1.0, *[ROTATION_LENGTH] * 3])  # Factors that conv
 # A direction counts as singular if its singular value of J, with all rows in metres, is below this [m]. At this value,
 # a torque error of 0.1 Nm causes a force error of 2 N.
 _SINGULAR = 0.05
-_NOTHING = 1e-9  # Smaller displacements [m], [rad] and velocities [m/s], [rad/s] count as zero.
+_NOTHING = 1e-9  # Displacements [m], [rad] and velocities [m/s], [rad/s] below this count as zero.
 
 
 def estimate_wrench(J: Array, tau: Array) -> Array:

@@ -11,9 +11,9 @@ inertia is multiplied by the squared gear ratio. It is 20 to 140 kg for a robot 
 every acceleration would stretch the spring, by 30 mm at 1 m/s^2. With the feed-forward, the spring bears only the
 errors of the model, and may be soft. How a resting arm yields to a push does not change.
 
-**Torque rate.** A full stop at 10 rad/s^2 needs 70 Nm more in a joint that moves the whole arm. The torque rises no
-faster than ``torque_rate_limit``, and meanwhile the tool deviates from the reference. The arm may then leave the
-distances that the reference keeps.
+**Torque rate.** In a full stop at 10 rad/s^2, the torque of a joint that moves the whole arm changes by 70 Nm. The
+torque rises no faster than ``torque_rate_limit``, and meanwhile the tool deviates from the reference. During this time,
+the measured arm may be closer to another body than the reference is permitted to be.
 
 **Payload.** A held object is part of M, C and g. Its mass is added and removed linearly over 0.3 s, so that no torque
 jumps.
@@ -60,7 +60,7 @@ class ImpedanceReport:
     # For each arm, the clipped displacement (6,) from the tool to the reference, in world axes [m], [rad].
     errors: dict[str, Array]
     clipped: tuple[str, ...]  # Arms whose deviation from their reference is clipped.
-    saturated: tuple[str, ...]  # Joints that would need more than their torque limit.
+    saturated: tuple[str, ...]  # Joints for which the control law asks for more torque than their limit.
     rate_limited: tuple[str, ...]  # Joints whose torque would have to change faster than ``torque_rate_limit`` allows.
     repelled: tuple[str, ...]  # Joints that are pushed away from a position limit.
     held: bool  # True if the state was not usable. The command is then the gravity torque at the last usable posture.
@@ -108,7 +108,7 @@ class ImpedanceController:
         self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
-        """Start again at rest at the measured posture. The first torque is the gravity torque there.
+        """Start again at rest at the measured posture. The first torque is the gravity torque at this posture.
 
         Changes of stiffness, damping or payload that have not ended yet are completed at once.
 
@@ -140,7 +140,7 @@ class ImpedanceController:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Bring the borne share of each payload's mass nearer to the wanted share, by at most ``change``."""
+        """Move the share of each payload's mass that its arm bears towards the wanted share, by at most ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]

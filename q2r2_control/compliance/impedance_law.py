@@ -47,7 +47,7 @@ def plausible(numbers: Array) -> bool:
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
     """Shorten ``errors`` (k, 6) to at most ``position`` [m] and ``rotation`` [rad].
 
-    The result (k,) is True for each error that was longer.
+    The result (k,) is True for each error that was longer than one of these bounds.
     """
     clipped = np.zeros(len(errors), dtype=np.bool_)
     for i in range(len(errors)):
@@ -120,11 +120,11 @@ class ImpedanceData(NamedTuple):
     M: Array  # (nv, nv) Joint-space inertia matrix.
     torque: Array  # (nv,) Input: torque of gravity and Coriolis forces. Output: torque of the control law [Nm].
     commanded: Array  # (nv,) The last torque, within all bounds [Nm].
-    saturated: BoolArray  # (nv,) Joints that would need more than their torque limit.
+    saturated: BoolArray  # (nv,) Joints for which the control law asks for more torque than their limit.
     late: BoolArray  # (nv,) Joints whose torque would have to change faster than its rate limit allows.
     J: Array  # (k, 6, nv) Jacobians at the measured posture.
     error: Array  # (k, 6) Clipped displacement from the measured to the wanted tool pose [m], [rad].
-    clipped: BoolArray  # (k,) Arms whose displacement was longer before it was clipped.
+    clipped: BoolArray  # (k,) True if the displacement of the arm was too long, and was clipped.
     repulsion: Array  # (nv,) Torque from position limits [Nm].
     wanted_twist: Array  # (k, 6) Twists of the tools at the reference that is due now [m/s], [rad/s].
     wanted_rotation: Array  # (k, 3, 3) Wanted rotations of the tools.

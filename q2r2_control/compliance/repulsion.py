@@ -75,13 +75,14 @@ _MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # Largest sum c / m [1/s].
 # The shell of a pair is its kept distance. Inside the shell, the damping rises from 0 to its value over this distance.
 # Outside the shell, the weight of the pair in the sums rises from 0 to 1 over the same distance [m].
 _BAND = 0.002
-_IMMOBILE = 1e-9  # A pair with a smaller mobility 1 / m cannot be moved by the joints [1/kg].
+_IMMOBILE = 1e-9  # If the mobility 1 / m of a pair is below this, the joints cannot move the pair [1/kg].
 # Smoothing length of distances, relative to the sum of the radii and the kept distance. The error is at most 0.3 mm.
 _SMOOTHING = 0.07
 # If two cores are closer than this share of the sum of the radii, their distance is measured exactly, because smoothing
 # would weaken the force.
 _DEEP = 0.25
-# Two bodies that may touch are pushed apart beyond this depth, which is relative to the sum of their radii.
+# If two bodies may touch, their wall begins at the permitted depth. If this share of the sum of their radii is less,
+# the wall begins at this share instead.
 _SOFT = 0.5
 # A moving obstacle that has to have no effect is replaced by this obstacle, which lies far below the cell.
 _OUT_OF_REACH = MovingObstacle(shape="sphere", size=(0.1,), position=(0.0, 0.0, -20.0), speed=0.0)
@@ -92,7 +93,7 @@ class RepulsionModel(NamedTuple):
 
     collision: CollisionModel
     smoothing: Array  # (p,) The weight e that smooths the distance, see pair_distance.py [m^2].
-    deep: Array  # (p,) Smaller distances than this are measured exactly [m].
+    deep: Array  # (p,) If the distance of a pair is below this, it is not smoothed [m].
     shell: Array  # (p,) Distance that the pair keeps [m].
     stiffness: float  # [N/m]
     damping_ratio: float
@@ -146,11 +147,12 @@ def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tupl
         if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
             continue
         distance = measure(model.collision, data.collision, p)
-        # Penetration of a pair that may touch counts as 0, so that it does not hide a pair that must not touch.
+        # If a pair that may touch penetrates, its distance counts as 0 in the search for the closest pair. Otherwise it
+        # would hide a pair that must not touch.
         apart = max(distance, 0.0) if model.shell[p] < 0.0 else distance
         if apart < least:
             least, closest = apart, p
-        # The smooth distance is never smaller than this distance.
+        # The smooth distance is never smaller than ``distance``, so the pair is not near by the smooth distance either.
         if distance >= model.shell[p] + _BAND:
             continue
         if distance > model.deep[p]:
@@ -242,8 +244,8 @@ class MeasuredSeparation:
         pairs = collision.pairs
         self._bodies, self._pairs = collision.bodies, pairs
         self._shell, self._smoothing, self._deep = np.zeros((3, len(pairs.first)))
-        # For each obstacle, the distances of its pairs. Its last pairs are its pairs with held objects, and are left
-        # out.
+        # One row for each obstacle: the distances that its pairs keep. The last pairs of a row are the pairs with held
+        # objects, and are left out.
         by_obstacle = kept_by_obstacles(robot, settings).values.reshape(max(len(self._obstacles), 1), -1)
         count = by_obstacle.shape[1] - len(robot.objects.by_arm) if self._obstacles else 0
         self._kept_by_obstacles = by_obstacle[:, :count].ravel()

@@ -120,7 +120,7 @@ class OwnConstraints:
         return not self._unknown and bool((self.matrix[first:] @ v >= self.lower[first:] - HARD_TOLERANCE).all())
 
     def active(self, v: Array) -> tuple[tuple[ActiveLimit, ...], float]:
-        """Return the constraints that are active at ``v`` (nv,) or broken there, and the largest violation [rad/s]."""
+        """Return the constraints that are active or broken at ``v`` (nv,), and the largest violation [rad/s]."""
         slack = self.lower - self.matrix @ v
         names = dict.fromkeys(name for name, lacks in zip(self._names, slack, strict=True) if lacks >= -_ACTIVE)
         limits = tuple(ActiveLimit(LimitKind.CONSTRAINT, (name.partition(" ")[2],)) for name in names)

@@ -95,7 +95,7 @@ class CartesianController(WatchedPairs):
         history = self._data_pointer.value.safety.history
         # The arrays that :meth:`withdraw` restores.
         self._restored = self._state.q, self._state.v, self._stop, *history.kept
-        self._before = tuple(array.copy() for array in self._restored)  # Their values before the last step.
+        self._before = tuple(array.copy() for array in self._restored)  # Values of these arrays before the last step.
         self._kept_before = self._live.kept, self._objects.kept
         self._solution = np.zeros(self._nv)  # The solution of the QP, copied from the solver's array.
         self._held = HeldTargets() if bridge_held else None
@@ -176,7 +176,7 @@ class CartesianController(WatchedPairs):
                 home. A posture that is not finite is not used.
 
         Returns:
-            The new reference, in arrays of its own.
+            The new reference, with arrays that no later step changes.
 
         Raises:
             RobotError: If ``targets`` is not a mapping.
@@ -203,12 +203,12 @@ class CartesianController(WatchedPairs):
             posture: As in :meth:`step`.
 
         Returns:
-            The problem, in arrays of its own.
+            The problem, with arrays that no later step changes.
 
         Raises:
             RobotError: If ``targets`` is not a mapping, or ``dt`` is not allowed.
         """
-        # The import is here, because the import is slow: it loads every solver.
+        # The import is inside this method, because it is slow: it loads every solver.
         from q2r2_control.control.solvers.qpsolvers import slack_problem
 
         check_kind("targets", targets, Mapping, _TARGETS, RobotError)
@@ -240,7 +240,7 @@ class CartesianController(WatchedPairs):
             posture: As in :meth:`step`.
 
         Returns:
-            The new reference, in arrays of its own.
+            The new reference, with arrays that no later step changes.
 
         Raises:
             RobotError: If ``targets`` is not a mapping.
@@ -319,7 +319,7 @@ class CartesianController(WatchedPairs):
         return self._reference(StepSummary(), usable)
 
     def _remember(self) -> None:
-        """Remember the state to which :meth:`withdraw` returns, and the distances that pairs keep there."""
+        """Remember the state to which :meth:`withdraw` returns, and the distances that pairs keep in this state."""
         self._kept_before = self._live.kept, self._objects.kept
         for kept, array in zip(self._before, self._restored, strict=True):
             kept[:] = array

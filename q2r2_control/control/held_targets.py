@@ -24,7 +24,7 @@ _FARTHEST = 1e3  # Largest coordinate of a target that is interpolated. No arm c
 # Largest difference of R R' from the identity, for the rotation R of a target that is interpolated. The controller
 # itself refuses targets for which this difference is more than twice as large.
 _ORTHONORMAL = 5e-4
-_STEPS = 1.5  # If a target changes after fewer steps than this, targets are new at (nearly) every step.
+_STEPS = 1.5  # If a target changes after fewer steps than this, targets count as new at every step.
 
 
 @dataclass(slots=True)
@@ -58,7 +58,7 @@ class _TargetPath:
 class HeldTargets:
     """The targets of all arms.
 
-    While a caller gives the same target for an arm, poses between the target before and this target are returned.
+    While a caller gives the same target for an arm, poses between the previous target and this target are returned.
     """
 
     def __init__(self) -> None:
@@ -104,6 +104,7 @@ class HeldTargets:
 def _is_ordinary(pose: pin.SE3) -> bool:
     """Return whether the pose has finite numbers and a rotation, so that it can be interpolated."""
     rotation = pose.rotation
-    if not (np.abs(rotation).max() < 2.0 and np.abs(pose.translation).max() < _FARTHEST):  # NaN fails too.
+    # The comparisons are written so that NaN fails them too.
+    if not (np.abs(rotation).max() < 2.0 and np.abs(pose.translation).max() < _FARTHEST):
         return False
     return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(rotation) > 0.0)

@@ -79,7 +79,7 @@ def _delete_old_versions(root: Path) -> None:
             if _VERSION.fullmatch(folder.name) and not folder.is_symlink():
                 used.append((folder.stat().st_mtime_ns, folder))
         except FileNotFoundError:
-            continue  # Another process has deleted it.
+            continue  # Another process has deleted the folder.
     for _, folder in sorted(used)[:-2]:
         shutil.rmtree(folder, ignore_errors=True)
 

@@ -24,7 +24,8 @@ from q2r2_control.types import Array
 # Least buffer of a pair [m]. Without a buffer, the separation rows would let a pair come exactly to its kept distance.
 # The certificate could then not prove that the pair keeps this distance.
 LEAST_BUFFER = 0.00025
-# Pairs that may touch are slowed down below this distance [m], because bodies are larger than the real parts in them.
+# If the distance of a pair that may touch is below this, the pair is slowed down [m]. A body encloses the real part and
+# is slightly larger, so the pair is slow before the real parts touch.
 _CONTACT_ZONE = 0.002
 # Largest depth by which two bodies may penetrate, as a share of the depth at which their cores meet.
 _DEEPEST = 0.8

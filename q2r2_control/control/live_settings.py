@@ -21,10 +21,11 @@ buffer of this pair then grows with d - S as above. Arms that rest within the bu
 infinity. When an object is gripped, each of its pairs keeps d - S - buffer, or the distance of its class if that is
 less. The known stop is then certified with the object too, so that the object never has to be refused. The kept
 distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
-it is assumed that both hands hold the same object. Its two bodies are not kept apart until one hand releases it.
+it is assumed that both grippers hold the same object. Its two bodies are not kept apart until one of the grippers
+releases it.
 
-**Gains** and weights change linearly to their new values. These are all arrays of the tasks that differ between the old
-and the new settings, and the gain of the separation rows. The certificate does not depend on them.
+**Gains** and weights change linearly to their new values. All arrays of the tasks that differ between the old and the
+new settings change in this way, and so does the gain of the separation rows. The certificate does not depend on them.
 """
 
 from __future__ import annotations
@@ -97,10 +98,13 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count keep as much distance as is certified. Measure them before."""
+        """Let pairs that have begun to count keep as much distance as is certified.
+
+        The pairs have to be measured before this call.
+        """
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
-        if (overlap & self._shared & self._new).any():  # Both hands hold one object.
+        if (overlap & self._shared & self._new).any():  # Both grippers hold the same object.
             kept[self._shared] = -np.inf
         self._write(kept)
         self._due = 0.0
@@ -206,7 +210,7 @@ class LiveSettings:
     def step(self, h: float) -> None:
         """Change kept distances and gains before a step of ``h`` [s].
 
-        The distances at the reference have to be computed before.
+        The distances at the reference have to be computed before this call.
         """
         if self._objects.growing:
             self._objects.step(h)

@@ -138,7 +138,7 @@ def _find_minimum(data: KernelData) -> bool:
 def assemble(
     model_pointer: KernelPointer, targets_pointer: KernelPointer, data_pointer: KernelPointer, h: float, tick: float
 ) -> tuple[bool, bool, bool]:
-    """Write cost, rows and box of a step of ``h`` [s]. The distances at the reference have to be computed before.
+    """Write cost, rows and box of a step of ``h`` [s]. The distances at the reference have to be known already.
 
     In the first step of a tick, ``tick`` is the duration of the tick [s], and the offered poses become the targets. In
     later steps of the tick, ``tick`` is below 0. Returns whether all targets were usable, whether all joints are within

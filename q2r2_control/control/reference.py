@@ -1,6 +1,6 @@
 """Observe the reference, and move it as far as the safety filter allows (compiled).
 
-To observe the reference means to compute the tool poses, the bodies' poses and the pairs' distances there.
+To observe the reference means to compute the tool poses, the bodies' poses and the pairs' distances at its posture.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Observed = tuple[int, float, int, float]
 
 @kernel
 def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
-    """Observe the reference after a reset. Return whether a stop from there is proven to keep all pairs apart."""
+    """Observe the reference after a reset. Return whether a stop from it is proven to keep all pairs apart."""
     model, data = pointee(model_pointer), pointee(data_pointer)
     rest_always(data.safety.history, data.safety.state.q)
     _observe(model, data)

@@ -80,7 +80,7 @@ class GivenSolution:
         try:
             given = np.asarray(x)
             numbers = np.array(given, dtype=np.float64) if given.dtype.kind != "c" else np.zeros(0)
-        except Exception:  # An object of the caller may raise any exception.
+        except Exception:  # ``x`` may be any object, which may raise any exception.
             return
         if numbers.ndim == 1 and len(numbers) >= nv and np.isfinite(numbers[:nv]).all():
             self._v = numbers[:nv]

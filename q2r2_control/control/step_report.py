@@ -24,12 +24,12 @@ class LimitNames:
         names = [item.name for item in geometry.geometryObjects]
         pairs = collision_model_of(
             robot, geometry
-        ).pairs  # The kernels' own pairs are not used here, because boxes that may be touched have other indices there.
+        ).pairs  # These are not the kernels' own pairs, in which boxes that may be touched have other indices.
         both = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self.pairs = [
             (names[first], names[second]) for first, second in both
         ]  # First come the pairs of the cell, then the pairs of objects, then the pairs of obstacles.
-        # Key and result of the last call of :meth:`of`, because in most ticks the same limits are active as before.
+        # Key and result of the last call of :meth:`of`. In most ticks, the same limits are active as in the last tick.
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
@@ -64,7 +64,7 @@ class StepSummary:
     unsolved: int = 0  # Bit i is 1 if substep i had no solution.
     slack: float = 0.0
     solve_time: float = 0.0
-    faults: tuple[str, ...] = ()  # As in StepReport.
+    faults: tuple[str, ...] = ()  # See :class:`StepReport`.
     constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that were active in the last substep.
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:

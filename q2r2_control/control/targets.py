@@ -52,8 +52,8 @@ class TaskTargets(NamedTuple):
     offered: IntArray  # (n,) What is offered in this tick: _NONE, _POSE or _NO_POSE.
     pose: Array  # (n, 4, 4) The offered pose as a homogeneous matrix, before it is checked.
     feed_forward_time: float  # Time constant that smooths the feed-forward [s].
-    teleport_speed: float  # A faster target has jumped [m/s].
-    teleport_turn: float  # A target that turns faster has jumped [rad/s].
+    teleport_speed: float  # If a target moves faster than this, it has jumped [m/s].
+    teleport_turn: float  # If a target turns faster than this, it has jumped [rad/s].
     scratch: PoseScratch
 
     @classmethod
@@ -111,7 +111,7 @@ class TargetTracker:
             return
         try:
             posture = np.asarray(posture)
-        except Exception:  # Rows may have different lengths, and an object of the caller may raise any exception.
+        except Exception:  # Rows of different lengths raise an exception, and an object of the caller may raise any.
             return
         if posture.shape == self._home.shape and posture.dtype.kind in "fiu" and np.isfinite(posture).all():
             self._targets.posture[:] = posture

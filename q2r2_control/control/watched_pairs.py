@@ -70,7 +70,7 @@ class WatchedPairs:
         From the next step on, the bodies of its fingers are the volume that the fingers sweep between the two openings.
         At first, and after :meth:`reset`, it is the volume between fully closed and fully open. A part of the present
         volume is always accepted. Another volume is accepted if every pair keeps its distance with it, at the reference
-        and during the certified stop from there. The caller may send the gripper only to openings that were accepted.
+        and during the certified stop from it. The caller may send the gripper only to openings that were accepted.
 
         Args:
             arm: The arm.
@@ -111,7 +111,7 @@ class WatchedPairs:
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
+        self._active.used[0] = 0  # Pairs that were active in the last step may no longer be monitored.
         self._obstacles.hold(self._objects.holding)
         self._observe_again(self._unchanged)
         self._objects.begin()
@@ -138,14 +138,14 @@ class WatchedPairs:
             obstacle: The obstacle; None if it has gone.
 
         Returns:
-            None, or a pair for which the certified stop may end too late, because the obstacle could be there first.
+            None, or a pair for which the certified stop may end too late: the obstacle could reach the arm earlier.
             This happens if an obstacle appears in front of a moving arm.
 
         Raises:
             ConfigError: If there is no such name.
         """
         changed = self._obstacles.put(name, obstacle)
-        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
+        self._active.used[0] = 0  # Pairs that were active in the last step may no longer be monitored.
         blocked = self._observe_again(changed) if self._state.v.any() else -1
         self._certified &= blocked < 0
         self._obstacles.keep_clear(0.0)

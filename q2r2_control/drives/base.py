@@ -176,7 +176,7 @@ class PositionDrive(Drive):
 class VelocityDrive(PositionDrive):
     """Commands v = v_ref + k (q_ref - q) within the limits: the reference's velocity, and feedback of the position.
 
-    If the state is not trusted or some ticks old, v is v_ref, without feedback.
+    If the state is not trusted, not finite, or more than ``_FRESH_TICKS`` ticks old, v is v_ref, without feedback.
     """
 
     mode = CommandMode.VELOCITY
@@ -263,7 +263,7 @@ class TorqueDrive(Drive):
         return Command(self.mode, reference.q, reference.v, torque.tau, grippers)
 
     def at_rest(self, state: RobotState) -> bool:
-        # Without a measurement, waiting for rest would never end.
+        # If the measurement is not finite, the arms count as at rest. Otherwise the caller would wait for ever.
         seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
         return not seen or float(np.abs(state.v).max()) <= _STILL
 

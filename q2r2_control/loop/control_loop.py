@@ -41,8 +41,9 @@ class LoopStep:
     refusals: dict[str, Reason] = field(default_factory=dict)  # For each arm that refuses its target, the reason.
 
 
-_REMEMBERED_LAG = 0.999  # In each tick the longest recent lag is multiplied by this factor, so that it is forgotten.
-_SAME_TIME = 1e-6  # A smaller difference is rounding [s].
+# In each tick, the longest recent lag is multiplied by this factor, and so is forgotten slowly.
+_REMEMBERED_LAG = 0.999
+_SAME_TIME = 1e-6  # A difference of times below this counts as rounding [s].
 
 
 class ControlLoop:
@@ -77,8 +78,8 @@ class ControlLoop:
             watch: The limits for measured states.
             origins: See :class:`Supervisor`.
             external: See :class:`Supervisor`.
-            owns_plant: Whether this loop also commands the arms while they are stopped. If not, another controller then
-                holds the arms and gets no commands.
+            owns_plant: Whether this loop also sends commands while the arms are stopped. If False, it sends none then,
+                and another controller holds the arms.
             gripper_delay: The longest time until a gripper gets its command [s].
             standstill: See :class:`Supervisor`.
         """
@@ -126,8 +127,8 @@ class ControlLoop:
     def watch_skew(self, timings: Mapping[str, ArmTiming], lead: float, now: float) -> None:
         """Let supervision compare the lags of arms, each of which follows the reference with its own lag.
 
-        The caller calls it before a step and before an activation. The controller then keeps the arms apart for every
-        difference of their lags that may occur.
+        The caller calls this method before a step and before an activation. The controller then keeps the arms apart
+        for every difference of their lags that may occur.
 
         Args:
             timings: The timing of each arm's messages.
@@ -149,7 +150,7 @@ class ControlLoop:
         """Activate the arms at once, because the caller knows that they are at rest at ``state``.
 
         Raises:
-            Q2R2Error: If the controller cannot start there.
+            Q2R2Error: If the controller cannot start at ``state``.
         """
         self.supervisor.activate(replace(state, stamp=now), now)
         self._begin(state, {}, now)
@@ -276,7 +277,7 @@ class ControlLoop:
     def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
         """Let grippers and drive begin at ``state``, where the controller was reset.
 
-        Grippers still count as holding the objects that they held before.
+        Grippers still count as holding the objects that they held before the reset.
         """
         self._grasps.tell_again()
         self._limiter = GripperLimiter(self.controller, self._delay)

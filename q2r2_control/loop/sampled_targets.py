@@ -21,7 +21,7 @@ class SampledTargets:
     """Tool targets at every step, on straight lines from each sample to the next.
 
     The controller itself interpolates targets that its caller holds for some steps. It assumes that each target is held
-    for the same time as the target before. This class gets the rate of the samples instead. The motion is therefore
+    for the same time as the previous target. This class gets the rate of the samples instead. The motion is therefore
     smoother if samples come unevenly, or less than nine times a second. The targets reach each sample with a delay of
     :attr:`delay` [s]. Steps in between get poses on the line between two samples::
 
@@ -63,7 +63,7 @@ class SampledTargets:
 
         Returns:
             True if the sample is used. False if the pose is not finite or its matrix is not a rotation; the arm then
-            goes on to its last sample.
+            moves on to its last sample.
 
         Raises:
             RobotError: If the arm does not exist, ``pose`` is not a pinocchio.SE3, or the time is not finite.

@@ -23,13 +23,13 @@ _TRIES = 40
 LED = 2.0  # Time of the upward motion before the hand releases its button [s].
 # Longest time from the release of the hand's button until the arm brakes: the timeout of a silent hand [s].
 _LATENCY = 0.15
-LEAST_SPEED = 0.01  # The stop of a slower tool is not measured [m/s].
+LEAST_SPEED = 0.01  # If a tool is slower than this, its stop is not measured [m/s].
 _STANDS = 1e-3  # Joints nearer than this to their final positions count as resting [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class JointMotion:
-    """The motion of a joint that was commanded a degree away and back."""
+    """The motion of a joint that was commanded to move by one degree and back."""
 
     joint: str
     commanded_deg: float  # Commanded motion away from the first posture.

@@ -1,7 +1,7 @@
-"""A run that is killed while hands move its arms. Another process, which goes on, has to stop the arms.
+"""A run that is killed while hands move its arms. Another process, which still runs, has to stop the arms.
 
-If a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop. Then this process
-ends and releases its ports. A commissioning checks this with a loop that runs in a process of its own.
+If a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop. Then the answering
+process ends and releases its ports. A commissioning checks this with a loop that runs in a process of its own.
 """
 
 from __future__ import annotations

@@ -9,14 +9,14 @@ from q2r2_control.summary.run_summary import Histogram
 from q2r2_control.types import RobotState
 
 _SHORTEST_DT = 1e-6  # Least duration of a tick that :meth:`LoopClock.wait` returns [s].
-# Shorter sleeps are left out [s]. Nobody sees the difference, because a window shows each picture of the arms for eight
-# times as long.
+# Sleeps that are shorter than this are left out [s]. Nobody sees the difference, because a window shows each picture of
+# the arms for eight times as long.
 _SHORTEST_SLEEP = 0.004
 # If simulated time is farther behind the computer's clock than this, it does not catch up [s]. The run goes on in slow
 # motion.
 _LONGEST_LAG = 0.1
 _WINDOW = 1.0  # Time over which late ticks are counted [s].
-_MANY_LATE = 0.1  # The loop falls behind if a larger share of the ticks in a window is late.
+_MANY_LATE = 0.1  # The loop falls behind if more than this share of the ticks in a window is late.
 
 
 class WallPace:
@@ -76,7 +76,7 @@ class LoopClock:
         return max(self.now - before, _SHORTEST_DT)
 
     def keep_pace(self) -> None:
-        """Wait if simulated time is ahead of the computer's clock, and must not pass faster than this clock."""
+        """If simulated time is ahead of the computer's clock and must not pass faster than this clock, wait."""
         if self._pace is not None:
             self._pace.wait_for(self.now - self.start)
 
@@ -88,7 +88,10 @@ class LoopClock:
         return late * self.period > _MANY_LATE * _WINDOW
 
     def after(self, duration: float) -> bool:
-        """Return whether at most half a period of ``duration`` [s] is left. Rounding errors then add no tick."""
+        """Return whether the run has lasted ``duration`` [s], or at most half a period less.
+
+        Because of this tolerance, rounding errors cannot add a tick.
+        """
         return self.now - self.start >= duration - 0.5 * self.period
 
     def read(self) -> float:

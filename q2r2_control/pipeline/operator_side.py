@@ -94,7 +94,7 @@ class OperatorSide:
         return targets
 
     def take_events(self, start: float) -> list[Event]:
-        """Return and log the events of the arms since the last call, with times since ``start`` [s]."""
+        """Return and log the events of the arms since the previous call, with times since ``start`` [s]."""
         events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
         for event in events:
             stopped = (

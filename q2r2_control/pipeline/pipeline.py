@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 STOPPING = "stopping"  # The state of every arm while the run ends.
 _STOP_ALLOWANCE_S = 1.0  # Further time, after full braking, for an arm that still has to return into its limits.
-_REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
+_REST = 1e-6  # The reference is at rest if no joint is faster than this [rad/s].
 _ROUNDING_S = 1e-9
 # Longest time for which a simulated plant executes one torque, unless a period is longer. If a late tick let it execute
 # a torque for 0.1 s, the torque would drive the arms into each other.
@@ -186,7 +186,7 @@ class Pipeline(RequestedRun):
         return preflight_faults(self.robot, self.config.control.without_contact(), self.controller)
 
     def stop(self) -> None:
-        """Bring the arms to rest and end the run. If no run goes on, end the next run when it begins.
+        """Bring the arms to rest and end the run. If there is no run now, end the next run when it begins.
 
         Any thread and any signal handler may call this method.
         """
@@ -197,10 +197,10 @@ class Pipeline(RequestedRun):
 
         Args:
             duration: Length of the run [s]; None if only a stop ends it.
-            realtime: True if the loop follows the clock, and a late tick moves no joint farther than a period allows.
-                False if time is simulated, which makes the run repeatable.
-            paced: True if simulated time must not pass faster than the clock. On a slow computer it passes more slowly.
-                The result is the same, bit for bit.
+            realtime: True if the ticks follow the computer's clock. A late tick then moves no joint farther than the
+                velocity limits allow in one period. False if time is simulated, which makes the run repeatable.
+            paced: True if simulated time must not pass faster than the computer's clock. On a slow computer it passes
+                more slowly. The result is the same as without ``paced``, bit for bit.
 
         Raises:
             ConfigError: If the duration is not positive, or if the plant does not support this kind of time.
@@ -432,7 +432,7 @@ class Pipeline(RequestedRun):
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
-        assert step.reference is not None  # A pipeline commands its plant in every tick.
+        assert step.reference is not None  # In a pipeline, every tick has a reference and a command.
         assert step.command is not None
         self.plant.apply(step.command)
         withdrawn = self._sessions is not None and self._sessions.withdraws()

@@ -53,7 +53,7 @@ class RequestedRun:
 
     @property
     def impedance(self) -> ImpedanceController | None:
-        """The impedance, which exists only in torque mode."""
+        """The impedance controller of the drive; None if the mode is not torque."""
         return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:
@@ -72,7 +72,7 @@ class RequestedRun:
         self.requests.append(Reason(TeleopReason.ENGAGE_REQUESTED))
 
     def give_back(self) -> None:
-        """Give the arms back from the hands to the policy, which goes on where the arms are. Any thread may call it."""
+        """Let the policy move the arms again, from the poses that they have now. Any thread may call this method."""
         self.requests.append(Reason(TeleopReason.POLICY_REQUESTED))
 
     def mark(self, action: Action) -> None:
@@ -110,8 +110,8 @@ class RequestedRun:
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> None:
         """Report where a moving obstacle is now, or that it is gone. Any thread may call it.
 
-        :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way. In
-        real time, the report ages from now on, also before the run begins. Raises :class:`ConfigError` if
+        :meth:`CartesianController.move_obstacle` says what follows, and an event names the pair that this method
+        returns. In real time, the report ages from now on, also before the run begins. Raises :class:`ConfigError` if
         ``control.moving_obstacles`` lacks the name.
         """
         check_obstacle(name, obstacle, self.config.control.moving_obstacles)

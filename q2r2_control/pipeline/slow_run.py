@@ -1,7 +1,7 @@
 """Move arms slowly, to given postures or with simulated hands, while a person at a terminal watches.
 
-The pipeline runs in a thread of its own, keeps every promise of an ordinary run, and holds the arms between the
-motions. The speed limits of its controller are 5 % of the joints' limits, so that nothing can move faster.
+The pipeline runs in a thread of its own, gives every guarantee of an ordinary run, and holds the arms between
+the motions. The speed limits of its controller are 5 % of the joints' limits, so that nothing can move faster.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class SlowRun:
         self._end_run()
 
     def _end_run(self) -> None:
-        with stop_on_signals(self._pipeline.stop):  # A signal brings the arms to rest first.
+        with stop_on_signals(self._pipeline.stop):  # A signal does not interrupt the stop of the arms.
             self._pipeline.stop()
             self._thread.join()
 

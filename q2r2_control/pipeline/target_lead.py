@@ -32,7 +32,7 @@ class TargetLead:
 
         Args:
             targets: The present targets by arm, in the world frame; None for an arm without a target.
-            dt: Time since the targets of the last call [s].
+            dt: Time since the targets of the previous call [s].
             delay: Delay of the plant [s].
         """
         velocities, self._velocities = self._velocities, {}

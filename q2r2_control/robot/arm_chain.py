@@ -59,7 +59,7 @@ def arm_ends(tree: LinkTree) -> list[str]:
 
 
 def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
-    """Return the joints that continue the chain from the links fixed to ``link``; [] if a hand begins there."""
+    """Return the joints that continue the chain from the links fixed to ``link``; [] if these joints move fingers."""
     body, depth = tree.fixed_to(link), len(tree.chain(link))
     onwards = [
         joint
@@ -70,7 +70,7 @@ def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list
         ends = {joint_end(joint, "child") for joint in onwards}
         longest = max(len(tree.chain(end)) - depth for end in tree.joint_to if ends & set(tree.path(end)))
         if depth >= longest > 0:
-            return []  # These are the fingers of a hand.
+            return []  # These joints move the fingers of a gripper.
     return onwards
 
 

@@ -76,7 +76,8 @@ class Mounted(NamedTuple):
 
     model: Model
     joint: ET.Element  # The joint between this flange or tool and the part before it.
-    is_flat: bool  # True if it sits flat on the part before it. An SRDF may then exclude pairs between both parts.
+    # True if this part lies flat on the part before it. An SRDF may then exclude pairs between both parts.
+    is_flat: bool
 
 
 class ArmAssembly:
@@ -111,7 +112,10 @@ class ArmAssembly:
         self.joints = named_joints(self.tree, self.frame, config.joints, self.key)
 
     def _mount(self, part: Model, what: str, mount: PoseConfig, is_flat: bool, frame: str | None = None) -> None:
-        """Put a flange or a tool on the end of the arm. The new end is ``frame``, or the part's own end."""
+        """Put a flange or a tool on the end of the arm.
+
+        The new end of the arm is the link ``frame`` of this part; if ``frame`` is None, it is the part's last link.
+        """
         key = f"{self.key}.{what}"
         for other in (self.model, *(mounted.model for mounted in self.mounted)):
             for tag in ("link", "joint"):
@@ -161,7 +165,7 @@ class ArmAssembly:
         return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
     def mounted_exclusions(self) -> list[ET.Element]:
-        """Return the excluded pairs of flange and tool: pairs within each of them, and pairs with parts before it."""
+        """Return the excluded pairs of flange and tool: pairs within one part, and pairs with the parts before it."""
         parts, carriers = [], [self.model.description]
         for mounted in self.mounted:
             part = mounted.model.description
@@ -266,7 +270,8 @@ def check_position(joint: ET.Element, position: float, key: str) -> None:
         return
     unit = "m" if joint.get("type") == "prismatic" else "rad"
     radians = math.radians(position)
-    # A position beyond half a turn that is within the limits after conversion is most likely in degrees.
+    # If a position is beyond half a turn [rad], but within the limits when it is read as degrees, it is most likely in
+    # degrees.
     hint = f"; {position:g} degrees are {radians:.4g} rad" if unit == "rad" and abs(position) > math.pi else ""
     hint = hint if lower <= radians <= upper else ""
     raise ConfigError(f"{key} = {position:g}: joint {joint.get('name')} allows {lower:g} .. {upper:g} {unit}{hint}")

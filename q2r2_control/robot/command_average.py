@@ -14,7 +14,7 @@ and accelerations. If the reference stays within an interval of a joint, so does
 **Distances.** A mean of postures is not a posture of the path, but it is near one. Let the reference be at ``q(c + s)``
 at the times of the window around its centre ``c``. The mean of ``q(c + s) - q(c) - s v(c)`` is at most A mean(s^2) / 2,
 and the mean of ``s v(c)`` is 0. With n >= 2 references the period is below W, and this bound is at most A W^2 / 8.
-Twice as much is allowed for, so that ticks may be irregular (``drives/command_average.py``). The reference keeps its
+Twice this bound is used here, so that ticks may be irregular (``drives/command_average.py``). The reference keeps its
 distances at ``c``, also between two ticks. A pair's distance changes by no more than the sum, over the joints, of the
 joint's displacement times the distance of the pair's bodies from the joint's axis. The reference therefore keeps the
 required distance plus this sum.

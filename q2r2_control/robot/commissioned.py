@@ -17,7 +17,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.compose import compose
 
-FIRST_SPEED = 0.1  # Share of the cell's speed that is allowed at first.
+FIRST_SPEED = 0.1  # Share of the cell's speed at which real arms move, unless the user asks for full speed.
 
 
 def sign_off_file(cell: Path) -> Path:

@@ -134,7 +134,7 @@ def parse_urdf(
     Raises:
         RobotError: If the text cannot be used.
     """
-    # A URDF may be parsed by this function too, because both formats begin in the same way.
+    # ``parse_srdf`` can parse a URDF too, because the root element of both formats is <robot>.
     root = parse_srdf(text, where)
     _check_numbers(root, where)
     unify(root, where)

@@ -231,7 +231,7 @@ def _fit(local: Array, x: Array) -> tuple[float, Array]:
     radius = float(across.max()) * (1 + abs(x[4]))
     reach = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
     top, bottom = float((height - reach).max()), float((height + reach).min())
-    if top < bottom:  # A sphere at any height between these two encloses every point.
+    if top < bottom:  # A sphere with its centre between these heights encloses every point.
         top = bottom = (top + bottom) / 2
     return radius, place + np.outer([bottom, top], direction)
 

@@ -119,7 +119,7 @@ def sweep_fingers(
         for item in geometry.geometryObjects:
             if (link := link_of(item.name)) not in links:
                 continue
-            # The finger joints that move the body, from the hand outwards.
+            # The finger joints that move the body, from the base of the gripper outwards.
             chain = [joint for joint in tree.chain(link) if joint_end(joint, "child") in links]
             kinds = {joint.get("type", "") for joint in chain}
             if not chain or not kinds <= _KINDS:

@@ -48,9 +48,9 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     """Extend fixed upright boxes that stand on the floor downwards, so that no body is pushed out at the bottom.
 
     A body inside a box is pushed out through the nearest face. It cannot leave through the underside of a box on the
-    floor. If a hand were near the underside, and its wrist above the box, they would be pushed in opposite directions,
-    and stay there for ever. The boxes therefore reach deep into the floor. The part of the box above the floor does not
-    change.
+    floor. If a gripper were near the underside, and the wrist above the box, the two would be pushed in opposite
+    directions, and would never leave the box. The boxes therefore reach deep into the floor. The part of the box above
+    the floor does not change.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
     if floor is None:

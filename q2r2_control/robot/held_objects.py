@@ -1,14 +1,14 @@
 """Held objects: bodies that are fixed to the tools, and the monitored pairs with them.
 
 The objects are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the
-same bodies as the link to which it is fixed, and with all obstacles. It has no pairs with the hand that holds it, and
-none with the fingers of other hands, because these must be able to take the object over.
+same bodies as the link to which it is fixed, and with all obstacles. It has no pairs with the gripper that holds it,
+and none with the fingers of other grippers, because these must be able to take the object over.
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
 taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
-them until one of them meets an edge. When two polyhedra begin to overlap, an edge of one of them enters the other one.
-The distance of two boxes is therefore the least distance of the twelve edges of each box from the other box. Each edge
-is a capsule without a radius.
+the faces until one of the points meets an edge. When two polyhedra begin to overlap, an edge of one of them enters the
+other one. The distance of two boxes is therefore the least distance of the twelve edges of each box from the other box.
+Each edge is a capsule without a radius.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class HeldObjects:
 
     geometry: pin.GeometryModel  # ``Robot.collision_model``, followed by the bodies and pairs of objects.
     by_arm: dict[str, HeldObject]
-    # For each of the objects' pairs, the arms that have to hold their objects. Otherwise the pair does not count.
+    # For each of the objects' pairs, the arms that have to hold their objects so that the pair counts.
     holders: tuple[frozenset[str], ...]
 
     def pair_names(self) -> tuple[tuple[str, str], ...]:
@@ -130,9 +130,9 @@ class _Pairs:
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
-    """Return the bodies with which the object has pairs. The hand that holds it and all fingers are left out."""
+    """Return the bodies with which the object has pairs. The gripper that holds it and all fingers are left out."""
     items = geometry.geometryObjects
-    # All obstacles count, also those that the hand itself cannot reach, because an object reaches farther.
+    # All obstacles count, also those that the gripper itself cannot reach, because an object reaches farther.
     found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)
     for pair in geometry.collisionPairs:
         first, second = items[pair.first], items[pair.second]

@@ -2,9 +2,9 @@
 
 A good home has joints near the middle of their ranges. The tool is before and below the shoulder, points forwards and
 down, and can move in all directions. Gravity requires clearly less torque than the joints' limits. The bodies are
-clearly farther apart than the distances that they keep, most of all below the tool, because the tool works below its
-home position. Two conditions are required: gravity is within the torque limits, and every pair is slightly farther
-apart than its kept distance. If a posture violates one of them, its cost jumps.
+clearly farther apart than the distances that they keep. The additional distance is greatest below the tool, because the
+tool works below its home position. Two conditions are required: gravity is within the torque limits, and every pair is
+slightly farther apart than its kept distance. If a posture violates one of them, its cost jumps.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ _AHEAD = np.array([0.8, 0.0, -0.6])  # Wanted direction in which the tool points
 _LEAST_GAIN = 0.15
 _BORNE = 0.7  # Share of the torque limits that gravity may require.
 _ROOM = 0.04  # Wanted distance of a pair in addition to the distance that it keeps [m].
-_BELOW = 0.16  # Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less.
+# Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less than this.
+_BELOW = 0.16
 _NEEDED = 0.005  # Required additional distance [m].
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # Points on two axes of the tool's frame [m].

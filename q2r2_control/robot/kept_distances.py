@@ -90,7 +90,7 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
     speed = np.full(len(names), np.inf)
     count = len(robot.collision_model.collisionPairs)
     last = count + len(robot.objects.holders)
-    # Pairs of held objects need no contact_allowed, because the distances that they keep may be negative anyway.
+    # Pairs of held objects need no contact_allowed, because a cell can set negative distances for them.
     for i, contact in enumerate(settings.contact_allowed):
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed

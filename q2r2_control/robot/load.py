@@ -21,7 +21,7 @@ from q2r2_control.types import Array
 LEAST_POSTURES = 8
 MODEL, PENDANT = "its tool's model", "the pendant, if its load data are the model's,"
 _LEAST_SPREAD = 0.2  # Least singular value of the regressor per posture, relative to g [m].
-_LIGHT = 0.05  # The centre of a smaller mass is not reported [kg].
+_LIGHT = 0.05  # If a mass is below this, its centre is not reported [kg].
 _MASS_BOUND, _CENTRE_BOUND = 0.3, 50.0  # Greatest difference from the expected load [kg], [mm].
 _EXPLAINED = 1.0  # Greatest residual with which a model of the arm is good enough [Nm].
 

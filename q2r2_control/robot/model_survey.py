@@ -159,7 +159,7 @@ class CapsuleFit:
     beyond: float  # Lower bound on the greatest distance of its surface from the mesh's convex hull [m].
     wasted: float  # Share of its volume that is outside the hull.
     capsules: int  # Number of capsules with clearly less volume than one capsule; 1 if there is no such number.
-    then_wasted: float  # The wasted share with this number of capsules.
+    then_wasted: float  # Share of the volume of ``capsules`` capsules that is outside the hull.
 
 
 def capsule_fits(description: Description, several: Collection[str]) -> list[CapsuleFit]:

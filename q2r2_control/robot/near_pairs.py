@@ -164,8 +164,8 @@ def warning_at_home(
     more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
     if elsewhere := len(never) < len(lines):
-        # A pair that overlaps at home is not watched. At another home, it may not overlap, and is then watched. If the
-        # pair can never keep its distance, the remedies have to include it too.
+        # A pair that overlaps at home is not watched. After a change to a home without this overlap, it is watched. If
+        # the pair can never keep its distance, the remedies have to include it too.
         hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
         never += [links for links in hardly if links not in never]
     # With an SRDF, links that overlap at home are no longer left out automatically. The lines for the SRDF therefore

@@ -77,7 +77,7 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
         return str(package_folder(name, file.parent, packages))
 
     try:
-        # For $(find NAME), xacro asks only ament's Python package, which may not be installed. xacro therefore gets
+        # For $(find NAME), xacro asks only ament's Python package, which is not always installed. xacro therefore gets
         # ``find``.
         substitution_args._eval_find = substitution_args._eval_dict["find"] = find
         text: str = xacro.process_file(str(file), mappings=given).toxml()

@@ -45,7 +45,7 @@ class KnownParts:
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:
-        """Return the roles that the tree shows. Joints beyond an arm's own joints count as joints of its fingers.
+        """Return the facts that the tree shows. Joints beyond an arm's own joints count as joints of its fingers.
 
         ``chains`` are the joints of each arm, from base to tool.
         """

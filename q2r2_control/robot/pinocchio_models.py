@@ -25,7 +25,7 @@ def joint_origin(joint: ET.Element) -> pin.SE3:
 
 
 def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[str, float]) -> None:
-    """Fix in place every joint of the URDF ``robot`` except the joints in ``movable``.
+    """Change the URDF ``robot``: make every joint a fixed joint, except the joints in ``movable``.
 
     All programs that read this URDF then have the same fixed joints. A joint with one axis is fixed at its value in
     ``positions`` [rad or m], or at 0 if it has none. A planar or floating joint is fixed at its origin.

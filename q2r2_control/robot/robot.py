@@ -210,7 +210,7 @@ class Robot:
 
         Movable joints behind the last joint of an arm count as joints of its fingers. The links to which these joints
         are attached, and all links behind them, are the arm's tool. No link counts as an obstacle. A warning names
-        pairs that would block the arm at home, and pairs that overlap only there.
+        pairs that would block the arm at home, and pairs that overlap only at home.
 
         Args:
             path_or_xml: The URDF as a file or a text.
@@ -341,14 +341,14 @@ class Robot:
     def _check_operators_frames(self, config: Config) -> None:
         """If the external mode is ``filtered``, check that the operator's frame is at the cell's tool.
 
-        Targets have to begin there.
+        Targets have to begin at the cell's tool.
         """
         if config.external is None or not config.external.filtered:
             return
         for arm in self.arms:
             frame, tool = config.external.arm(arm).tool_frame, self.arms[arm].tool_frame
             if frame is None or not self.model.existFrame(frame, pin.FrameType.BODY):
-                continue  # Only /tf has this frame, so the arm's node compares it there.
+                continue  # Only /tf has this frame, so the arm's node checks its pose on /tf.
             at_home = self.tool_pose(self.home, arm)
             frame_id = self.model.getFrameId(frame, pin.FrameType.BODY)
             between = at_home.actInv(pin.updateFramePlacement(self.model, self._data, frame_id))

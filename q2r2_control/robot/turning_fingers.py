@@ -12,13 +12,13 @@ interpolation between both ends of the step has an error of at most an eighth of
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 
 because the second derivative by two turning joints is a product of rotations about both axes with the lever of the
-outer joint. Here r bounds the distance of x from the axis of a joint. For a joint that slides, r = 1 if it is the outer
-one of two joints, and r = 0 if it is the inner one or both. Several driven joints in one chain are interpolated one
-after the other. Each interpolation takes means of the values of the interpolation before it. The errors therefore add
-up, and derivatives by two different driven joints do not count. Interpolated points lie in the hull of the samples. A
-capsule is convex. If it encloses each sample with the shape's radius and that remainder, it encloses all points. For
-any segment, this radius is the distance of the farthest sample from the segment, plus the shape's radius and the
-remainder. []
+outer joint. Here r bounds the distance of x from the axis of a joint. If the outer joint slides and the inner joint
+turns, r = 1. If the inner joint slides, or if i and k are the same sliding joint, r = 0. Several driven joints in one
+chain are interpolated one after the other. Each interpolation takes means of the values of the interpolation before it.
+The errors therefore add up, and derivatives by two different driven joints do not count. Interpolated points lie in the
+hull of the samples. A capsule is convex. If it encloses each sample with the shape's radius and that remainder, it
+encloses all points. For any segment, this radius is the distance of the farthest sample from the segment, plus the
+shape's radius and the remainder. []
 
 The choice of the segment affects only the size of the capsule. Some candidates lie along the shape and some along the
 path of its middle. The candidate with the least mean width is taken. Capsules of nested intervals are not nested: the
@@ -51,7 +51,7 @@ _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 @dataclass(frozen=True, slots=True)
 class FingerJoint:
-    """A joint that moves a shape, in the frame of the arm's link to which the hand is fixed.
+    """A joint that moves a shape, in the frame of the arm's link to which the gripper is fixed.
 
     The shape was drawn at the position ``home``. The positions of all joints with one driver are linear functions of
     the driver's position, also beyond the stroke. All positions are in [m or rad].
@@ -78,7 +78,7 @@ class FingerJoint:
 
 
 class Capsules(NamedTuple):
-    """One capsule for each of b bodies, in the frame of the link to which the hand is fixed."""
+    """One capsule for each of b bodies, in the frame of the link to which the gripper is fixed."""
 
     start: Array  # (b, 3) [m]
     end: Array  # (b, 3) [m]
@@ -93,7 +93,7 @@ class TurningBody:
     name: str  # Name of the geometry object.
     ends: Array  # Both ends of its segment as drawn (2, 3) [m].
     radius: float  # Radius as drawn [m]. A capsule around it has at least this radius.
-    joints: tuple[FingerJoint, ...]  # The joints that move it, from the hand outwards.
+    joints: tuple[FingerJoint, ...]  # The joints that move it, from the base of the gripper outwards.
 
     def curvatures(self) -> Array:
         """Return a bound (j, j) [m] on the second derivatives of a shape's points by the positions of two joints.
@@ -230,7 +230,7 @@ class TurningSweeps:
 def sticks_out(inner: Capsules, outer: Capsules) -> Array:
     """Return for each capsule of ``inner`` whether it is not within the capsule of ``outer`` (b,).
 
-    A capsule is the hull of the balls at its ends. It is within another one exactly if both balls are.
+    A capsule is the hull of the balls at its ends. It is within another capsule exactly if both of its balls are.
     """
     points = np.stack([inner.start, inner.end], axis=1)
     farthest = _farthest(points, outer.start[:, None], outer.end[:, None])[:, 0]

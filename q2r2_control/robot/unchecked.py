@@ -20,8 +20,8 @@ from q2r2_control.robot.description import LinkTree
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-# A lighter link counts as a frame [kg]. In models, frames of sensors and tools have 0.1 mg to 10 g, because some
-# programs need a mass. The lightest real body without a shape in known models is a jaw of 20 g.
+# A link that is lighter than this counts as a frame [kg]. In models, frames of sensors and tools have 0.1 mg to 10 g,
+# because some programs need a mass. The lightest real body without a shape in known models is a jaw of 20 g.
 LIGHTEST_BODY = 0.015
 
 

@@ -50,7 +50,7 @@ def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> 
             for drawing in link.findall("visual"):
                 shape = ET.SubElement(link, "collision")
                 shape.extend(copy.deepcopy(part) for part in drawing if part.tag in ("origin", "geometry"))
-                # Only these shapes are scaled: drawings keep the units of their files, as RViz expects.
+                # Only the collision shapes are scaled. The <visual> elements keep their units, as RViz expects.
                 scale_to_metres(shape.iter("mesh"))
 
 

@@ -2,8 +2,8 @@
 
 Each arm follows the reference with its own lag [s]. The certificate (control/safety/arm_skew.py) keeps two arms apart
 as long as their lags differ by no more than its window. This watch keeps the difference within the window, in every
-loop. If one arm falls behind or stops sending, the reference follows its certified stop until the arms are together
-again. After 0.1 s of waiting the arms stop, and are activated again from rest.
+loop. If one arm falls behind or stops sending, the reference follows its certified stop until the lags differ by no
+more than permitted. If this takes more than 0.1 s, the arms stop, and are activated again from rest.
 """
 
 from __future__ import annotations

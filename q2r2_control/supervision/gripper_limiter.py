@@ -6,9 +6,9 @@ and recently commanded openings. The interval therefore covers all of these, plu
 openings in the interval that the controller has accepted. This holds for closing as well, because fingers that turn
 reach farther forward as they close.
 
-If the wanted opening lies outside the interval, the gripper goes there in steps. A step is halved if the certificate
-fails, and doubled if the certificate holds. A smaller interval counts as soon as it is certified. Until then the wider
-one counts.
+If the wanted opening lies outside the interval, the gripper moves to the wanted opening in steps. A step is halved if
+the certificate fails, and doubled if the certificate holds. A smaller interval counts as soon as it is certified. Until
+then the wider interval counts.
 """
 
 from __future__ import annotations
@@ -108,11 +108,11 @@ class _Gripper:
         self._wanted = math.nan
         # Largest difference between the next opening and the commanded one. It is 1 when a new opening is wanted.
         self._step: float
-        self._seen: list[Interval] = []  # The openings in the present time span, and in the time span before.
+        self._seen: list[Interval] = []  # The openings in the present time span, and in the previous one.
         self._since = -math.inf
 
     def rests(self, wanted: float, measured: float, now: float) -> bool:
-        """Return whether a tick brings nothing new, as most ticks do.
+        """Return whether a tick brings no new information, which is so in most ticks.
 
         The wanted opening is then commanded already, and the measured opening lies in the interval seen so far.
         """
@@ -202,7 +202,7 @@ class GraspWatch:
         self._grips = {arm: Grip(arms[arm].stroke, stall) for arm in controller.robot.objects.by_arm}
 
     def tell_again(self) -> None:
-        """Tell a controller that was reset which objects the grippers held before."""
+        """Tell a controller that was reset which objects the grippers held before the reset."""
         for arm, grip in self._grips.items():
             if grip.holds:
                 self._controller.set_holding(arm, True)

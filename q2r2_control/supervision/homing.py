@@ -47,7 +47,7 @@ class WayHome(Protocol):
 
     @property
     def outcome(self) -> ReasonKind | None:
-        """The result of the motion home; None while it goes on."""
+        """The result of the motion home; None while the motion continues."""
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
         """Return the setpoints for the next ``dt`` [s].
@@ -80,7 +80,7 @@ class JointHoming:
         # The smallest value so far of the distance between the next waypoint and the farthest joint [rad].
         self._least_left = np.inf
         self._waited = 0.0  # Time without progress [s].
-        self.outcome: ReasonKind | None = None  # How the motion home ended; None while it goes on.
+        self.outcome: ReasonKind | None = None  # How the motion ended; None while the motion continues.
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
         """See :class:`WayHome`."""
@@ -88,7 +88,7 @@ class JointHoming:
             if float(np.abs(v).max()) > _AT_REST:
                 return HomingStep(None, {})
             self._distances, kept = self._look()
-            # A pair that is closer than this distance at the start of the path may stay as close as it is there.
+            # If a pair is closer than ``kept + _EXTRA_DISTANCE`` at the start, it may stay as close as at the start.
             self._needed = np.minimum(kept + _EXTRA_DISTANCE, self._distances(q) - 1e-4)
             self._at = self._leg = q.copy()
             self._search = self._check_paths(self._at)
@@ -242,7 +242,7 @@ class Homing:
         return dict.fromkeys(self._robot.arms) | step.targets
 
     def check(self, reference: Reference) -> Reason | None:
-        """End the motion home if the arms have arrived or cannot go on. Return the outcome; None if it goes on.
+        """End the motion home if the arms have arrived or cannot go on. Return the outcome; None if it continues.
 
         Args:
             reference: The newest reference. If the arms cannot move on, the outcome names the pair with the least

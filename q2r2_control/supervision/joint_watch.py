@@ -73,7 +73,7 @@ class JointWatch:
         self._source = source  # Text that names the sender in messages, such as " from /node", or "".
         self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
-        self._lost = False  # True if the fault is that of :meth:`lose`, and all states since then were good.
+        self._lost = False  # True if :meth:`lose` has recorded the fault, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None
@@ -159,7 +159,7 @@ class JointWatch:
         self.fault, self._near_at, self._lost = None, None, False
 
     def accept_at_once(self, state: RobotState, now: float) -> None:
-        """Accept ``state`` without waiting, because the caller knows that the arms are at rest there."""
+        """Accept ``state`` without waiting, because the caller knows that the arms are at rest in it."""
         self.state, self._q = state, state.q.tolist()
         self._still_since, self._still_at = now, self._q
         self.accept()
@@ -188,7 +188,7 @@ class JointWatch:
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
         # The first fault is kept, because it says most about the cause. Before the first good state, the newest fault
-        # says most, and replaces it.
+        # says most, and replaces the earlier fault.
         if self.fault is None or self.state is None:
             self.fault = fault
 
@@ -256,7 +256,7 @@ class ExternalArms:
     def targets(self, wanted: dict[str, pin.SE3 | None], last: Reference | None) -> dict[str, pin.SE3 | None]:
         """Return the ``wanted`` targets, by arm.
 
-        If an arm has no target and rests in the ``last`` reference, its target is the tool's pose there.
+        If an arm has no target and rests in the ``last`` reference, its target is the tool's pose in this reference.
         """
         for arm, pose in wanted.items():
             if pose is not None:

@@ -72,7 +72,7 @@ def preflight_faults(
     ]
     too_close = too_close_at_home(robot, kept_distances(robot, settings), remedies=True)
     faults += too_close
-    if controller is not None and not too_close:  # If a pair is too close, it is known why there is no certificate.
+    if controller is not None and not too_close:  # A close pair already explains a missing certificate.
         controller.reset(robot.home)
         report = controller.step({}, controller.settings.max_substep).report
         controller.reset(robot.home)

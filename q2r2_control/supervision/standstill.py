@@ -1,9 +1,9 @@
-"""Find a controller that stands still: it is asked for motion, and the measured arm does not move.
+"""Find a controller that stands still: its commands change, but the measured arm does not move.
 
 A controller whose process is frozen is still in the ROS graph, and its middleware still acknowledges messages. The
-joint states come from another process and go on. Meanwhile the reference moves away from the arm. When the controller
-wakes up, its newest command is a jump. An arm that only lags moves as fast as it was asked to a little earlier. An arm
-whose controller stands still does not move at all, which shows within a few states:
+joint states still come, from another process. Meanwhile the reference moves away from the arm. When the controller
+wakes up, its newest command is a jump. An arm that only lags moves at the speed that was commanded a little earlier. An
+arm whose controller stands still does not move at all, which shows within a few states:
 
     path of m in W <= 0.1 |r(t) - r(t - W)|,  |r(t) - r(t - W)| >= least,  |r(t - W) - m(t)| >= ahead.
 
@@ -31,7 +31,7 @@ WINDOW = 0.05  # Length W of the window [s].
 _STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded distance.
 _FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded distance.
 _LOOK_PERIOD = 0.0075  # Least time between two checks; the loop may tick more often [s].
-_STATE_GAP = 0.045  # After a longer gap between two states the window begins again [s].
+_STATE_GAP = 0.045  # If the gap between two states is longer than this, the window begins again [s].
 
 
 @dataclass(frozen=True, slots=True)

@@ -349,7 +349,7 @@ class Supervisor:
         """Activate the arms at once, because the caller knows that they are at rest at ``state``.
 
         Raises:
-            RobotError: If the controller cannot start there.
+            RobotError: If the controller cannot start at ``state``.
         """
         self._stopped, self.paused = None, False
         self.targets.reset()

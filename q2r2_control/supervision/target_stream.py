@@ -22,7 +22,8 @@ from q2r2_control.quaternions import Vector, floats_of, inverse, product, rotati
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import Pose
 
-# A new stream begins with a jump that no hand makes between two messages [m], [rad].
+# If the targets of a refused stream jump by at least this much, a new stream begins [m], [rad]. No hand moves so far
+# between two messages.
 _JUMP, _TURN = 0.05, 0.25
 
 

@@ -60,7 +60,7 @@ _ALONE = 1.0  # A break in the sequence counts as recent for this time [s].
 class SequenceWatch:
     """Finds a second publisher by the sequence numbers of one topic. All times are times of receipt [s].
 
-    A break in the sequence is a number that cannot come from the publisher of the number before.
+    A break in the sequence is a number that cannot come from the publisher of the previous number.
     """
 
     def __init__(self) -> None:
@@ -185,7 +185,7 @@ class TargetStreams:
             stream.reset()
 
     def expire(self, now: float) -> list[Reason]:
-        """End the streams whose targets have ceased. Return the reasons of all ends since the last call."""
+        """End the streams whose targets have ceased. Return a reason for each stream that has newly ended."""
         for arm in self._streams:
             self._expire(arm, now)
         ended, self._newly_ended = self._newly_ended, []

@@ -21,7 +21,7 @@ from q2r2_control.types import Array, HandInputs, HandSample, Pose
 
 # The next three numbers are shares of a trigger's travel.
 _SLACK = 0.05  # The first and the last part of the travel have no effect, since not every trigger reaches its ends.
-_HYSTERESIS = 0.02  # A smaller motion of the trigger counts as tremor and changes nothing.
+_HYSTERESIS = 0.02  # If the trigger moves by less than this, the motion counts as tremor and changes nothing.
 _PICK_UP = 0.05  # The trigger begins to move the gripper when it is this near to the gripper's opening.
 
 
@@ -102,7 +102,7 @@ class ArmTeleop:
 
         Args:
             settings: The new settings.
-            last: The last target in the world frame. An engaged arm is anchored there, so that it does not jump.
+            last: The last target in the world frame. An engaged arm is anchored at it, so that it does not jump.
             now: The time [s].
         """
         if of_controls(settings) != of_controls(self._settings):
@@ -121,7 +121,7 @@ class ArmTeleop:
     def receive(self, sample: HandSample, now: float) -> Reason | None:
         """Process one sample of this arm's hand; returns the fault for which the arm must stop, or None."""
         stamp = min(sample.inputs_stamp, now)
-        if -math.inf < stamp and self._inputs_stamp <= stamp:  # An older reading, overtaken by a newer one, is ignored.
+        if -math.inf < stamp and self._inputs_stamp <= stamp:  # A reading that is older than the last one is ignored.
             self._inputs_stamp, self.heard_of = stamp, True
             self._presses += self._gestures.receive(sample.inputs, stamp)
             before = self._held.actions
@@ -160,7 +160,7 @@ class ArmTeleop:
         self.events.append(Event(now, self.arm, self.state, self.state, reason))
 
     def take_presses(self, now: float) -> list[Press]:
-        """Return the gestures since the last call. The caller passes them to :meth:`act`, or drops them."""
+        """Return the gestures since the previous call. The caller passes them to :meth:`act`, or drops them."""
         presses, self._presses = self._presses + self._gestures.due(now), []
         if (stuck := self._gestures.take_stuck(now)) is not None:
             self.record_event(now, Reason(TeleopReason.NOT_ENGAGED, cause=stuck))

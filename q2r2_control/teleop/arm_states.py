@@ -91,7 +91,7 @@ _NEXT = {(source, line.cause): line.destination for line in TRANSITIONS for sour
 
 
 def next_state(state: ArmState, cause: Cause) -> ArmState:
-    """Return the state to which ``cause`` leads from ``state``; ``state`` itself if the cause has no effect there."""
+    """Return the state to which ``cause`` leads from ``state``; ``state`` itself if the cause has no effect in it."""
     return _NEXT.get((state, cause), state)
 
 

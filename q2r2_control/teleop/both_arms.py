@@ -1,4 +1,4 @@
-"""Carry out the actions that concern both arms: stop, motion home, carrying, recording. Any hand may ask for them."""
+"""Carry out the actions for both arms: stop, motion home, carrying, recording. Either hand may ask for them."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _MIN_SPACING = 0.005
 _USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
 # Gains of the delay-locked loop: the shares of a sample's jitter that correct the sample's time and the period.
 _PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02
-_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand in this share of the gap.
+_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand in this share of the gap's duration.
 
 
 class Interpolator:
@@ -32,7 +32,7 @@ class Interpolator:
     speed. A delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early
     or late. If no sample comes for longer than ``delay``, the output rests at the newest sample, because nothing is
     extrapolated. When samples come again, the output does not jump: it catches up with the hand in the share
-    ``_CATCH_UP`` of the gap.
+    ``_CATCH_UP`` of the gap's duration.
     """
 
     def __init__(self, delay: float, period: float = _USUAL_PERIOD) -> None:
@@ -76,7 +76,7 @@ class Interpolator:
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
         """Return the position [m] and the rotation at ``now`` [s].
 
-        The third value is the rotation vector from the last call's rotation to this call's rotation [rad].
+        The third value is the rotation vector from the previous call's rotation to this call's rotation [rad].
 
         ``now`` must not go back.
         """
@@ -172,7 +172,7 @@ class PoseFilter:
         self._interpolator.add(*pose, stamp, now)
 
     def at(self, now: float) -> Pose:
-        """Return the filtered pose at ``now`` [s]; the last pose if ``now`` is not after the last call."""
+        """Return the filtered pose at ``now`` [s]; the last pose if ``now`` is not later than in the previous call."""
         dt = now - self._now
         if dt <= 0.0:
             return self._out

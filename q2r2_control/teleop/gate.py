@@ -17,7 +17,7 @@ from q2r2_control.types import HandSample, Pose
 _MAX_COORDINATE = 1e6  # No tracking system measures such a large coordinate [m].
 _QUATERNION_LENGTHS = (1e-6, 1e6)  # A quaternion with a length outside this range counts as no rotation.
 # Least time over which a speed is measured [s]. Messages that a network has delayed arrive less than 1 ms apart. A
-# speed between two of them would mean nothing.
+# speed that is computed from two such messages would be far too high.
 _SPEED_WINDOW = 0.05
 
 
@@ -37,7 +37,7 @@ class PoseGate:
         self.pose: Pose | None = None
         self.stamp = -math.inf  # Time of the newest pose, usable or not [s].
         self._problem: Reason | None = None
-        self._recent: deque[tuple[float, Pose]] = deque()  # Times [s] and poses, the first one about _SPEED_WINDOW old.
+        self._recent: deque[tuple[float, Pose]] = deque()  # Times [s] and poses. The oldest is about _SPEED_WINDOW old.
 
     @property
     def problem(self) -> Reason | None:
@@ -52,9 +52,9 @@ class PoseGate:
         """Judge the pose of a sample.
 
         Returns:
-            True if the pose is new and usable, so that an arm may be anchored to it; and the reason why an engaged arm
-            must not follow it, or None. After a jump the pose is usable and there is a reason: the arm must not follow
-            the jump, but may be anchored to the new pose.
+            Two values. The first is True if the pose is new and usable, so that an arm may be anchored to it. The
+            second is the reason why an engaged arm must not follow the pose, or None. After a jump the pose is usable
+            and there is a reason: the arm must not follow the jump, but may be anchored to the new pose.
         """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):

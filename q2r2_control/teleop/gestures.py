@@ -13,7 +13,8 @@ from q2r2_control.types import HandInputs
 
 # If a control has been held since the first reading, the operator is told after this time [s].
 _STUCK_AFTER = 1.0
-# A control counts as held above the first travel, and as released below the second one. In between nothing changes.
+# A control counts as held above the first travel, and as released below the second travel. Between the two travels,
+# nothing changes.
 _HELD, _LET_GO = 0.6, 0.4
 
 

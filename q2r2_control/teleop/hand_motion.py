@@ -18,7 +18,8 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Pose, moved_by
 
-Shares = tuple[float, float]  # Factors of the scales of position and rotation: 1 normally, 0 if locked.
+# Factors of the position scale and the rotation scale: normally 1, less for precise motion, 0 if the hand locks it.
+Shares = tuple[float, float]
 
 
 class HandMotion:
@@ -39,7 +40,7 @@ class HandMotion:
         self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
         self.filtered: Pose | None = None  # The filtered pose of the hand from which the last target was computed.
-        # The newest pose of the hand, not filtered. The second pose is the target that would follow from this pose if
+        # Two poses: the newest pose of the hand, not filtered; and the target that would follow from this hand pose if
         # neither leash nor workspace had held the target back since the anchor.
         self._newest: tuple[Pose, Pose] | None = None
         self._bound_one_tool()

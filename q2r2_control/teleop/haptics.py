@@ -67,10 +67,10 @@ _WHILE_STATE_STAYS: dict[ReasonKind, Pulse] = {
 }
 
 # Slip is the distance or the angle by which leash and workspace have held the target back.
-_SLIP_STEP = 0.02  # Slip of the target's position from one pulse to the next [m].
-_SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from one pulse to the next [rad].
+_SLIP_STEP = 0.02  # Increase of the position's slip from one pulse to the next [m].
+_SLIP_ANGLE_STEP = 0.1  # Increase of the rotation's slip from one pulse to the next [rad].
 _NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from one pulse to the next, and the distance at which pulses begin [m].
-_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Force from one pulse to the next, and the force of the strongest pulse [N].
+_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Increase of the force between two pulses; the force of the strongest pulse [N].
 _PAUSE = 0.05  # Pause between two vibrations, so that the hand does not feel them as one [s].
 
 

@@ -31,7 +31,8 @@ from q2r2_control.types import Interval, Pose
 # is 0.2 mm and 0.2 degrees to either side, and more than the noise of a headset. This noise has a standard deviation of
 # 0.2 mm and 0.03 degrees. Two samples of a hand at rest are at most about seven standard deviations apart.
 _COMES_BACK = 1.5e-3, 12e-3
-# A tool that is slower counts as blocked [m/s], [rad/s]. A tool of this speed stops within a fraction of a millimetre.
+# A tool that is slower than this counts as blocked [m/s], [rad/s]. At this speed, a tool stops within a fraction of a
+# millimetre.
 _HELD_UP = 0.05, 0.2
 # With any settings, a controller ignores the velocity of a target that steps faster than this [m/s], [rad/s].
 _NO_MOTION = 10.0, 35.0
@@ -100,8 +101,8 @@ class Leash:
         self.position = ComponentLeash(settings.distance, *limits[0])
         self.rotation = ComponentLeash(settings.angle, *limits[1])
         self._components = self.position, self.rotation
-        # The leashes are computed from this distance on, and from this cosine of half the angle on. Both values are
-        # slightly before the end of the leash.
+        # The leashes are computed only if the distance from the tool to the target is at least the first value, or if
+        # the cosine of half the angle is at most the second value. Both values are slightly before the end of a leash.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
         self._last: _Tick | None = None
@@ -221,7 +222,7 @@ class Workspace:
     def hold(self, target: Pose) -> Vector | None:
         """Return the permitted position nearest to ``target`` (world frame) [m]; None if ``target`` is permitted.
 
-        The caller anchors the motion there.
+        The caller anchors the motion at this position.
         """
         asked = target[0]
         if self._bounds is None:

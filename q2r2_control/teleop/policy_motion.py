@@ -242,7 +242,7 @@ def _moved_to(goal: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
 
 
 def _segment_at(times: list[float], t: float) -> tuple[int, float]:
-    """Return the index of the last action up to ``t``, and the share of the time to the next action that is over."""
+    """Return the index of the last action up to ``t``, and the share of the time to the next action that has passed."""
     index = min(max(bisect_right(times, t) - 1, 0), max(len(times) - 2, 0))
     if len(times) == 1:
         return 0, 0.0

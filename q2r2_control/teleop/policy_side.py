@@ -20,7 +20,7 @@ from q2r2_control.types import ActionChunk, Array
 class PolicySide:
     """Lets a policy drive the arms.
 
-    After a fault, an arm whose hand has sent readings waits for a press. An arm without an operator goes on with the
+    After a fault, an arm whose hand has sent readings waits for a press. An arm without an operator continues with the
     next chunk that begins at the arm's tool pose. Linked arms begin together or not at all, since they may hold one
     object. The arms that have to begin together are the arms in the newest chunk, and the arms that a fault has stopped
     together.

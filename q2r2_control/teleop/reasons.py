@@ -1,4 +1,4 @@
-"""The kinds of reasons that the teleoperation layer gives, or that an operator or a program causes there."""
+"""The kinds of reasons for events of teleoperation: controls of the operator, requests of a program, and faults."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class Teleop:
         return next(hand for hand, driven in self._pair.arm_of_hand.items() if driven == arm)
 
     def take_events(self) -> list[Event]:
-        """Return the changes of state and the refused presses since the last call, in order of time."""
+        """Return the changes of state and the refused presses since the previous call, in order of time."""
         events = sorted((event for arm in self._arms.values() for event in arm.events), key=lambda event: event.t)
         for arm in self._arms.values():
             arm.events.clear()
@@ -270,7 +270,7 @@ class Teleop:
         """Return the time to use, and a fault or None.
 
         The time does not go back if the clock goes back by at most the timeout. It is a fault if the clock goes back by
-        more, is not finite, or is ahead by more than the timeout since the last call.
+        more, is not finite, or has advanced by more than the timeout since the previous call of this method.
         """
         last = self._now
         if not math.isfinite(now):

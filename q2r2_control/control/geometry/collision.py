@@ -47,7 +47,7 @@ class Pairs(NamedTuple):
     # (p, k) Bound on the distance of the geometry's points from the joint's axis [m]; 1 for a sliding joint.
     reach: Array
     leverage: Array  # (p,) Sum of ``reach`` over the joints.
-    carried: IntArray  # (p,) 1 if some joint moves both geometries alike. Such a joint is not listed.
+    carried: IntArray  # (p,) 1 if some joint moves both geometries alike. Such a joint is not listed in ``joint``.
 
 
 class CollisionModel(NamedTuple):
@@ -81,7 +81,7 @@ class Contact(NamedTuple):
 
 
 class CollisionData(NamedTuple):
-    """Poses of joints and bodies at a posture, written by :func:`update_placements`, and the last measurement there."""
+    """Poses of joints and bodies, written by :func:`update_placements`, and the last measurement at this posture."""
 
     placements: Placements
     posed: BodyPlacements

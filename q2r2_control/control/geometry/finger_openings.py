@@ -32,7 +32,7 @@ class FingerOpenings:
     """The interval of openings of each arm's gripper. At first, it is the whole interval from closed to open."""
 
     def __init__(self, robot: Robot, bodies: CollisionBodies) -> None:
-        """Begin with the ``bodies`` of ``robot``, in which fingers sweep their whole path."""
+        """Begin with the ``bodies`` of ``robot``. At first, the body of each finger covers the finger's whole path."""
         self.intervals: dict[str, Interval] = dict.fromkeys(robot.arms, ALL_OF_THE_WAY)
         self._bodies = bodies
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]

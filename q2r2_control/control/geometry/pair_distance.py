@@ -1,7 +1,7 @@
 """Compute the signed distances of monitored pairs, exact and smooth, and the rows that are their gradients (compiled).
 
 For the closest points p1, p2 and the unit normal n from the first body to the second, the distance changes with d' = n'
-(J_p2 - J_p1) v. Only joints that move one body relative to the other appear in it.
+(J_p2 - J_p1) v. Only joints that move one body relative to the other appear in this equation.
 
 **Smooth distances** have a gradient that never jumps. Forces that follow the gradient need this. The closest points of
 two parallel segments, or of a segment along a box's face, jump from end to end as the bodies tilt. Here a small cost

@@ -2,7 +2,8 @@
 
 One reference moves all arms, but each real arm follows it on its own: one arm may be delayed, and one arm may stop
 alone. The path of an arm has two parts: the postures that the reference had in the last ``window`` [s], and the
-postures from there to the end of the certified stop. It is assumed that each real arm is somewhere on its own path.
+postures from the present one to the end of the certified stop. It is assumed that each real arm is somewhere on its own
+path.
 
 **Claim.** Let n be a unit vector, and c the distance that two bodies of different arms have to keep. The corners e of a
 body are the two ends of a segment, or the eight corners of a box. Let
@@ -84,7 +85,7 @@ def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
     """Return whether pair ``p`` is so far apart that it keeps its distance at all points of both arms' paths.
 
     The last paragraph of this module's docstring has the proof. ``time`` is h + T / 2 [s], the time that counts for the
-    step and the stop. Call :func:`write_way` before.
+    step and the stop. Call :func:`write_way` before this function.
     """
     pairs = model.collision.pairs
     speed = speed_of(data.velocities, pairs.first[p]) + speed_of(data.velocities, pairs.second[p])

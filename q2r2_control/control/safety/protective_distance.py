@@ -89,7 +89,7 @@ def keep_clear(
         for p in range(obstacles.first[o], obstacles.first[o + 1]):
             lost = _SHARE * (least_stop + age) - age if age > _LOST else -np.inf
             if _stop_time(data, obstacles, o, p) < min(max(wanted, lost), longest):
-                _measure(model, data, obstacles, p)  # A lower bound of the distance does not suffice here.
+                _measure(model, data, obstacles, p)  # Here the exact distance is needed, not a lower bound.
                 stop_time = _stop_time(data, obstacles, o, p)
                 wanted = min(wanted, stop_time)
                 if age > _LOST:  # Until this time, the obstacle cannot have used up the free distance.

@@ -71,7 +71,7 @@ class SeparationRows(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """A state that the reference may take after the step, and a stop from there."""
+    """A state that the reference may take after the step, and a stop that begins in this state."""
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]

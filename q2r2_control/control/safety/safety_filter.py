@@ -53,7 +53,7 @@ def apply_safety_filter(
     if usable:
         total = 0.0
         for j in range(q.shape[0]):
-            # The solution may leave the box by the solver's tolerance. NaN may pass a clamp, but the sum is then NaN.
+            # The solution may leave the box by the solver's tolerance. NaN may pass a clamp, but ``total`` is then NaN.
             total += solution[j]
             data.wanted[j] = clamp(solution[j], data.box.lower[j], data.box.upper[j])
             total += data.wanted[j]
@@ -107,7 +107,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated, because growth can be refused.
+            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated: to refuse growth does no harm.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
@@ -138,8 +138,8 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
         return FOLLOWED
     unproven = data.unproven[0]
     if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
-        # No mixture is tried, because from rest a smaller motion would bring the pair closer too, and trying takes
-        # long.
+        # From rest, a smaller motion would bring the pair closer too. No mixture is tried, because this would only take
+        # time.
         return STOPPED
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
@@ -270,7 +270,8 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
         if far and distance[p] > always + horizon * fastest:
             continue  # ``fastest`` bounds the approach speed of any two bodies, so this pair needs no measurement.
         first, second = pairs.first[p], pairs.second[p]
-        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # Either arm may stop alone.
+        if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:
+            # One arm may stop while the other arm moves, so the speeds of both bodies are added.
             approach_speed = speed_of(data.velocities, first) + speed_of(data.velocities, second)
         else:
             approach_speed = fastest_approach(data.velocities, first, second)

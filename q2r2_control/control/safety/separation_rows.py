@@ -6,9 +6,10 @@ The rows tell the QP what the certified stop can do. Let B be the least free dis
 
 A step may use up only a share of B: B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function that is built
 from a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). A motion during which the pair's distance stays the same
-uses up nothing and is not slowed. A motion that brings the pair closer is slowed in time for the stop. The rows are
+uses up nothing and is not slowed. A motion that brings the pair closer is slowed early enough. The rows are
 linearised at those instants of the stop at which the free distance is least, or may soon be least, so that rows do not
-appear and disappear from tick to tick. An instant with more free distance than B may use up the difference at 50 /s.
+appear and disappear from tick to tick. At an instant with more free distance than B, the step may also use up the
+difference, at a rate of 50 /s.
 
 A stop takes the time T. At its time t, joints that stop together have travelled v s, with s = t - t^2 / 2T. If the stop
 after the step takes T too, the step changes the posture at the time t by D q, and the row is
@@ -64,7 +65,7 @@ _SAME_POINT = 0.005  # [m]
 _SAME_DISTANCE = 0.002  # [m]
 # If a stop bends the paths of a pair's points by less than this, its rows use the tangent at the start of the stop.
 _STRAIGHT = 1e-5  # [m]
-# Rate at which an instant may use up the free distance that it has beyond B [1/s].
+# Rate at which a step may use up the difference, if an instant has more free distance than B [1/s].
 _CATCH_UP = 50.0
 
 
@@ -72,8 +73,8 @@ _CATCH_UP = 50.0
 def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> None:
     """Write the rows that can bind in a step of ``h`` [s]. Each row has unit norm.
 
-    The pairs have to be measured at the reference before. The candidate and its rollout are overwritten with the
-    certified stop.
+    The pairs have to be measured at the reference before this call. The candidate and its rollout are overwritten
+    with the certified stop.
     """
     stay_with_stop(data)
     duration = begin_rollout(data)
@@ -108,7 +109,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
 
 @kernel
 def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: float, straight: bool) -> float:
-    """Write the distance [m] of pair ``p`` at each instant, infinite if it is skipped; return the least distance.
+    """Write the distance [m] of pair ``p`` at each instant; return the least distance. Skipped instants get infinity.
 
     If the paths are ``straight``, the pair is nearest at the start or at the end of the stop. If the pair is too close,
     only the start counts, because the pair has to open from its present position.

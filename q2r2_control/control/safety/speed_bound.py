@@ -123,7 +123,7 @@ def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: f
     """Write the bound rho + kappa on every joint's deviation from motion at constant velocity [rad or m].
 
     The bound holds in a step of ``h`` [s] and a stop of ``duration`` [s]. The travel of the joints in both has to be
-    written before. Returns h + T / 2 [s].
+    written before this call. Returns h + T / 2 [s].
     """
     parent, v, v_next, rollout = model.collision.chain.parent, data.state.v, data.candidate.v, data.rollout
     step, stop = rollout.step.travel, rollout.stop.travel
@@ -143,8 +143,8 @@ def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: f
 def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) -> float:
     """Return a lower bound on the distance of pair ``p``, which shares no joint, in the step and the stop [m].
 
-    Call :func:`write_deviations` before. ``data`` has to contain the velocities of the bodies, and the distances at the
-    reference or lower bounds of them. ``time`` is h + T / 2 [s].
+    Call :func:`write_deviations` before this function. ``data`` has to contain the velocities of the bodies, and the
+    distances at the reference or lower bounds of them. ``time`` is h + T / 2 [s].
     """
     pairs = model.collision.pairs
     approach = fastest_approach(data.velocities, pairs.first[p], pairs.second[p])

@@ -10,7 +10,7 @@ body relative to the other. One sample with the distance d therefore proves that
 pairs that share no joint, the speeds of their bodies at the reference give a better bound (speed_bound.py), which
 suffices for most pairs. If it does not suffice, the plane between the bodies is used, which takes the direction of
 motion into account (separating_plane.py). The stop is then checked in parts. Each part begins at a sample, and is as
-long as can be proven from there.
+long as can be proven from this sample.
 
 **Rounding.** A motion that is proven to end exactly at the required distance of a pair may end 1e-16 m below it. If a
 pair is below its required distance by less than ROUNDING, the full proof uses the present distance of the pair instead.
@@ -50,7 +50,7 @@ def step_travel(v: float, v_next: float, h: float) -> float:
 
 @kernel
 def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
-    """Return whether the step to ``data.candidate`` in ``h`` [s] and the full stop from there keep every pair apart.
+    """Return whether the step to ``data.candidate`` in ``h`` [s] and the full stop after it keep every pair apart.
 
     ``data.distance`` has the distances at the reference or lower bounds of them. A bound that does not suffice is
     replaced by the distance. ``data.velocities`` has the velocities at the reference. A pair that is too close must not
@@ -69,7 +69,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
     for p in range(data.distance.shape[0]):
         if data.distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
             continue  # No joint travels farther than ``farthest``, so the pair keeps its distance.
-        alone = apart and model.of_two_arms[p] == 1  # Each of the two arms may be anywhere on its path.
+        alone = apart and model.of_two_arms[p] == 1  # Then each of the two arms can be anywhere on its path.
         if is_far(model, data, p, time) if alone else _has_room(model, data, p, time):
             continue
         data.unproven[0] = p

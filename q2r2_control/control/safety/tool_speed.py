@@ -93,8 +93,8 @@ class ToolSpeeds(NamedTuple):
 def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
     """Return whether no tool is too fast in the step to ``data.candidate`` in ``h`` [s] and the full stop after it.
 
-    ``data`` has to contain the placements at the reference. The proof assumes that no tool is too fast there; otherwise
-    the known stop is being executed.
+    ``data`` has to contain the placements at the reference. The proof assumes that no tool is too fast at the
+    reference; otherwise the known stop is being executed.
     """
     limits = model.tools
     if limits.speed == np.inf:

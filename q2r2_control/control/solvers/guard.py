@@ -61,7 +61,7 @@ class Guard:
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
                 return QpSolution(np.array(v, dtype=float), max(float(solve_time), measured))
-        except (KeyboardInterrupt, SystemExit):  # A signal's handler raises these to end the program.
+        except (KeyboardInterrupt, SystemExit):  # A signal's handler raises these exceptions to end the program.
             raise
         except BaseException as error:  # Any other exception, such as a panic in Rust, counts as a failed solve.
             self.failure = raised(error)

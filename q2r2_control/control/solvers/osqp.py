@@ -31,7 +31,7 @@ _ROWS_STEP = 16  # Step between the numbers of rows for which OSQP is set up.
 _DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
     "eps_rel": 1e-5,
-    "max_iter": 10000,  # From a cold start, a problem with 60 contradictory rows needs half as many iterations.
+    "max_iter": 10000,  # From a cold start, a problem with 60 contradictory rows needs half of this number.
     "check_termination": 10,
     "adaptive_rho_interval": 50,
     "scaling": 0,

@@ -56,11 +56,11 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     )
 
 
-# These solvers cannot be used in a control loop without these options.
+# Without these options, the solvers that are named here cannot be used in a control loop.
 _DEFAULTS: dict[str, dict[str, Any]] = {
     # Without a limit, the active set of HiGHS may cycle for ever.
     "highs": {"output_flag": False, "qp_iteration_limit": 1000},
-    "scs": {"max_iters": 10000},  # With the default, which is ten times as many, a solve takes a second.
+    "scs": {"max_iters": 10000},  # The default is ten times as many. A solve then takes a second.
 }
 
 

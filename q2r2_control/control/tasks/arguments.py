@@ -33,8 +33,8 @@ def chosen_arms(robot: Robot, arms: Sequence[str] | None) -> list[str]:
 def positive(key: str, value: float, most: float = math.inf) -> float:
     """Return ``value`` as a float.
 
-    Raises :class:`ConfigError` unless it is a number above 0, and at most ``most``. If ``most`` is finite, it is an
-    angle [rad].
+    Raises :class:`ConfigError` unless it is a number above 0, and at most ``most``. If ``most`` is finite, ``value``
+    is an angle [rad].
     """
     if isinstance(value, bool) or not isinstance(value, float | int) or not (0.0 < value <= most and value < math.inf):
         up_to = "" if most == math.inf else f", at most {most:.2f} rad"

@@ -53,7 +53,7 @@ class PostureData(NamedTuple):
 
 @kernel
 def accumulate_posture_cost(model: TaskModel, data: TaskData, targets: TaskTargets, q: Array) -> None:
-    """Add the cost w |v - v_p|^2 of all joints. The Jacobians of the tools have to be written before."""
+    """Add the cost w |v - v_p|^2 of all joints. The Jacobians of the tools have to be written before this call."""
     gain, speed, v = model.posture.gain[0], model.posture.speed, data.posture.v
     for j in range(q.shape[0]):
         v[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
