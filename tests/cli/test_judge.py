@@ -123,7 +123,8 @@ class TestARunThatIsRecorded:
         assert written["episodes"] == [episode]
         again = one_object(q2r2("judge", str(tmp_path), "--json").stdout)["episodes"]
         assert again == [episode]
-        with AnyReader([kept.parent]) as bag:  # The file can still be read.
+        # Other programs can still read the recording, although the verdict is in the same folder.
+        with AnyReader([kept.parent]) as bag:
             assert bag.message_count > 0
 
     def test_the_verdict_is_printed_as_one_line_before_the_figures(self, tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def test_in_the_report_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_
     assert not any("finger" in name for name in report.closest_pair)
 
 
-def test_the_wall_uses_the_bodies_of_fingers_for_the_openings_that_were_set() -> None:
+def test_after_openings_are_set_the_wall_uses_the_finger_bodies_for_these_openings() -> None:
     random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
     closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
     farther = 0

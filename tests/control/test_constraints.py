@@ -250,7 +250,7 @@ def test_a_task_that_raises_an_exception_in_a_step_changes_nothing_and_is_named_
 
 
 class NothingToKeep:
-    """A constraint whose only row every velocity satisfies."""
+    """A constraint with a single row, which every velocity satisfies."""
 
     hard = True
 

@@ -1,4 +1,7 @@
-"""Obstacles that move on their own. Arms come to rest before an obstacle can touch them, and can work beside it."""
+"""Obstacles that move on their own. Arms come to rest before an obstacle can touch them, and can work beside it.
+
+In this file, a hand is such an obstacle, for example the hand of a person beside the arms.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,8 @@ from tests.control.scenarios import circle
 from tests.support.driven import Driven
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
+# The solver has no time limit, so that no result depends on the speed of the computer.
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})
 TABLE = 0.2  # Height of the table's top [m].
 FRAME_TO_TIPS = 0.013  # Distance from the tool frame to the finger tips [m].
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.

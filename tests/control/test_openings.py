@@ -161,7 +161,7 @@ class Cell(Driven):
     """A run that checks the contract, and measures distances with the real positions of the fingers."""
 
     def __init__(self, config: Config) -> None:
-        # No result depends on the clock.
+        # The solver has no time limit, so that no result depends on the speed of the computer.
         robot, settings = Robot.from_config(config), config.control.model_copy(update={"solve_time_limit": None})
         self.real, self.kept = RealHands(robot), kept_distances(robot, settings).values
         super().__init__(CartesianController(robot, settings), dt=DT)

@@ -58,7 +58,7 @@ def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_i
             bound_used.append((distance - least) / (distance - proven))
             for proof, other in ((1, 2), (2, 1)):  # Proof 2 uses four times as many instants as proof 1.
                 bend = data.history.bend[other].copy()
-                data.history.bend[other] = np.inf  # With this, the other proof proves nothing.
+                data.history.bend[other] = np.inf  # With an infinite bend, the other proof proves nothing.
                 proven = _largest(partial(keeps_apart_at_any_time, model, data, p, duration), distance)
                 data.history.bend[other] = bend
                 assert least >= proven - 1e-8

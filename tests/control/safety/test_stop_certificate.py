@@ -207,7 +207,7 @@ def test_a_step_that_brings_a_too_close_pair_closer_is_refused_even_if_the_pair_
     for q in _too_close(cell(name), np.random.default_rng(22), 200):
         apart = distances(cell(name), q[None])[0]
         if np.partition(apart, 1)[1] < MIN_DISTANCE:
-            continue  # Another pair is too close and could be the reason.
+            continue  # The step might be refused because of a second pair that is too close.
         gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, apart.argmin()] - apart.min()) / 1e-6
         parting = 0.01 * gradient / np.linalg.norm(gradient) ** 2  # The pair parts at 0.01 m/s.
         if _certified(name, motion_of(name, q, parting, parting)):
