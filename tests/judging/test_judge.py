@@ -307,7 +307,8 @@ def test_an_episode_with_one_figure_beyond_its_threshold_is_discarded_for_this_f
 
 def test_this_file_tests_every_threshold_of_episodes() -> None:
     tried = {case[0] for case in CASES}
-    of_subtasks = {"min_subtask_time", "max_subtask_time", "needs_subtasks"}  # See tests/recording/test_subtasks.py.
+    # These thresholds are tested in tests/recording/test_subtasks.py.
+    of_subtasks = {"min_subtask_time", "max_subtask_time", "needs_subtasks"}
     others = {"dropout", "keep_failed", "needs_end", "needs_task"}
     assert set(JudgeSettings.model_fields) - tried == others | of_subtasks
 

@@ -55,9 +55,9 @@ class Stream:
         self.published = self.left_out = 0
 
     def run(self, seconds: float, fault: Callable[[], Reason | None] | None = None) -> Reason | None:
-        """Publish for ``seconds``, or until ``fault`` returns a reason. By default, the reason is a silent listener.
+        """Publish for ``seconds``, or until ``fault`` returns a reason. Return this reason; None if there was none.
 
-        Return this reason, or None.
+        By default, ``fault`` returns a reason if a listener is silent.
         """
         end, find = time.monotonic() + seconds, fault or self._publisher.silence
         while time.monotonic() < end:

@@ -116,7 +116,8 @@ class Soak:
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
         self._late, self._ends = {"computer freezes"}, list(_ENDS)
         if self.pipeline.drive.mode is CommandMode.TORQUE:
-            self._late.add("loop freezes")  # With torques, a session then ends by itself, because no torques come.
+            # If the loop freezes, no torques come, and a session in torque mode ends by itself.
+            self._late.add("loop freezes")
             # The simulated arm keeps its last torque while its cabinet stands still.
             self._ends.remove("cabinet freezes")
         self._returns = False
@@ -196,7 +197,7 @@ class Soak:
         pause = float(self.random.uniform(0.02, 0.5))
         if self._end in ("pendant", "back at once"):
             cabinet.stop()
-            if self._end == "back at once":  # The session is back before the arms rest.
+            if self._end == "back at once":  # The overlay starts again before the arms rest.
                 cabinet.start_overlay()
         elif self._end == "safety stop":
             cabinet.safety_stop(Safety.STOP_1_ON_PATH)
