@@ -108,7 +108,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     ]  # Importing a module also imports its package, so packages are left out.
     known = {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in files}
     graph = {name: imported_by(file) & known.keys() for name, file in known.items()}
-    TopologicalSorter(graph).prepare()  # A circle would raise CycleError.
+    TopologicalSorter(graph).prepare()  # This call raises CycleError if modules import each other in a circle.
 
 
 @pytest.mark.parametrize(

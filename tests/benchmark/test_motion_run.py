@@ -33,7 +33,7 @@ SHORT = replace(
 
 
 class Standing:
-    """A controller that stands still, except for one joint in one tick, and that has no solution in another tick."""
+    """A controller that stands still. On request, a joint moves in one tick, and one tick has no solution."""
 
     name, limitations = "standing", "everything"
 

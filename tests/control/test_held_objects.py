@@ -1,6 +1,6 @@
-"""A held object is monitored. Its pairs keep their present distances at first, and greater distances when they open.
+"""A held object is monitored. When it is gripped, each of its pairs keeps the distance that the pair has.
 
-No arm moves because an object is gripped.
+No arm therefore moves because an object is gripped. When a pair opens, it keeps a greater distance.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Frames are evenly spaced in time. Each frame has the newest observation, and the first command that followed.
 
-The features have the numbers that their names say, and a frame has the newest picture at or before it.
+Each number in the features is the number that its name describes. A frame has the newest picture that was captured at
+the time of the frame or before it.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class LbrSoak:
         self._how, self._ends_at, self._progress = "start", math.inf, self.virtual.now
         self._phase, self._seen = Phase.INACTIVE, dict.fromkeys(SIDES, 0)
         self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # The newest command: session, tick, q, v.
-        self._late = 0  # The last tick that was late.
+        self._late = 0  # The number of the last tick that was late.
         self._brakings = 0  # Number of brakings so far.
         self._disturbed = 0.0  # Until this time, the end of a session may still be unnoticed [s].
         self.virtual.on_command = self._on_command

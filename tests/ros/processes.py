@@ -60,7 +60,7 @@ def _run(command: list[str], environment: dict[str, str], log: str) -> None:
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.argv = list(command)
-    sys.modules.pop(command[0], None)  # The module runs as __main__.
+    sys.modules.pop(command[0], None)  # The module runs anew, under the name __main__.
     runpy.run_module(command[0], run_name="__main__", alter_sys=True)
 
 

@@ -216,7 +216,7 @@ def test_a_stream_reports_its_end_only_if_its_operator_paused_the_arm(
     arm.destroy_node()
 
 
-_LOST = "_NODE_NAME_UNKNOWN_"  # rcl uses this name.
+_LOST = "_NODE_NAME_UNKNOWN_"  # rcl gives this name to a node whose name it does not know.
 LISTENER = """
 import rclpy
 from geometry_msgs.msg import PoseStamped

@@ -113,7 +113,7 @@ def test_the_speed_bound_holds_and_is_tight_if_all_joints_stop_together(speed: f
         closer, bound = now - least_along("dual_iiwa7", motion), now - bounds_of("dual_iiwa7", motion)
         assert (closer <= bound + 1e-12)[apart].all()
         used.append((closer / bound)[apart].max())
-    assert np.median(used) > 0.6  # A smaller value would show that the bound is too weak to be useful.
+    assert np.median(used) > 0.6  # A smaller median would show that the bound is too weak to be useful.
 
 
 @pytest.mark.parametrize("shape", [TOGETHER, OWN])

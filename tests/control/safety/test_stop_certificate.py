@@ -100,8 +100,8 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_clearly_safe_motions_
 def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
     """Yield two motions for each of ``count`` starts. Both have the same start and direction.
 
-    In the first motion, a pair comes slightly closer than the required distance. In the slower second motion, no pair
-    does.
+    In the first motion, a pair comes slightly closer than the required distance. The second motion is slower, and every
+    pair keeps the required distance.
     """
     found = 0
     for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):

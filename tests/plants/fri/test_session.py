@@ -168,7 +168,7 @@ def test_if_the_command_of_one_arm_is_late_both_commands_are_refused_and_both_ar
     cabinet, still, ones = Cabinet(), (0.0,) * 7, (1.0,) * 7
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
-    for _ in range(10):  # The reference leaves IPO at 1 rad/s^2 for 50 ms.
+    for _ in range(10):  # The reference accelerates from the posture IPO at 1 rad/s^2 for 50 ms.
         end = cabinet.now + 0.003
         passed = end - 0.013
         way, speed = 0.5 * passed**2, passed
@@ -295,7 +295,7 @@ def test_a_repeated_message_gets_the_same_answer_and_moves_nothing() -> None:
     for doubled, cabinet in cabinets.items():
         cabinet.ask(WAITING)
         cabinet.ask(ACTIVE)
-        for t in np.linspace(0.005, 0.1, 20):  # The reference leaves IPO at 1 rad/s^2.
+        for t in np.linspace(0.005, 0.1, 20):  # The reference accelerates from the posture IPO at 1 rad/s^2.
             end, there = cabinet.now + 0.003, tuple(q + 0.5 * t**2 for q in IPO)
             cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (t,) * 7, ones))
             answer = cabinet.ask(replace(ACTIVE, q=there), doubled=doubled)
