@@ -197,7 +197,7 @@ def test_if_the_certified_part_of_a_solution_violates_a_hard_row_the_certified_s
 
 
 @pytest.mark.parametrize("name", [name for name in ("clarabel", "quadprog") if name in qpsolvers.available_solvers])
-def test_other_solvers_keep_a_hard_row_too(robot: Robot, name: str) -> None:
+def test_solvers_other_than_daqp_also_keep_a_hard_row(robot: Robot, name: str) -> None:
     controller = CartesianController(robot, constraints=[StillJoint(3, hard=True)])
     stops = 0
     for tick in range(100):

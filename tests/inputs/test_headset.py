@@ -118,7 +118,7 @@ def test_vibrations_without_a_headset_or_a_subscription_are_dropped(server: Head
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
 
 
-def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_no_old_one(
+def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_no_old_vibration(
     server: HeadsetServer,
 ) -> None:
     with registered(server) as headset:

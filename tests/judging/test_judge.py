@@ -175,7 +175,7 @@ def test_a_verdict_is_written_beside_its_recording_with_all_figures_and_threshol
     assert episode["figures"]["arms"]["left"]["gripper_changes"] == 1
 
 
-def test_files_that_cannot_be_read_are_named_and_the_others_are_judged(clean: Path, tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_are_named_and_the_other_files_are_judged(clean: Path, tmp_path: Path) -> None:
     files = {"notes": b"no recording", "empty": b"", "magic": clean.read_bytes()[:8]}
     for name, data in files.items():
         (tmp_path / f"{name}.mcap").write_bytes(data)

@@ -137,7 +137,9 @@ def test_each_mode_of_the_tool_on_its_spring_returns_with_the_damping_ratio_of_t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["home", "reaching far", "elbow out"])
-def test_arms_with_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant, robot: Robot, name: str) -> None:
+def test_arms_whose_masses_differ_from_the_controllers_model_stay_stable_and_within_2_cm(
+    reweighed: MujocoPlant, robot: Robot, name: str
+) -> None:
     loop = TorqueLoop(reweighed, robot, SETTINGS, posture(robot, name), SLOW)
     largest = 0.0
     for _ in loop.ticks(2.5):

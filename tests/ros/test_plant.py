@@ -152,7 +152,7 @@ def test_if_another_node_commands_the_arms_they_are_released_and_the_other_node_
         wait_until(lambda: "/test commands the arms on /joint_trajectory" in caplog.text, "the other is named")
 
 
-def test_a_plant_whose_arms_are_missing_or_commanded_by_others_raises_an_error_of_one_line(
+def test_a_plant_whose_arms_are_missing_or_commanded_by_other_nodes_raises_an_error_of_one_line(
     node: Any, robot: Robot, config: Config, processes: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plant_module, "_WAIT", 0.5)

@@ -294,7 +294,7 @@ def test_a_whole_set_is_recorded_and_judged_and_ends_at_ctrl_c(node: Any, proces
     enough = states.wait_for()["messages"] + 10_000  # Each tick has about 10 messages.
     wait_until(lambda: states.wait_for()["messages"] > enough, "the arms are moved", patience=600.0)
     assert call(node, "/recorder/stop").success
-    # Nodes with real-time priority may use all processors. They are stopped, so that the judging process gets time.
+    # Nodes with real-time priority can use all processors. They are stopped, so that the judging process gets time.
     others = [pid for pid in children(process.pid) if "recorder" not in Path(f"/proc/{pid}/cmdline").read_text()]
     for pid in others:
         os.kill(pid, signal.SIGSTOP)

@@ -97,7 +97,8 @@ def test_the_command_watch_shows_nodes_and_subscribes_to_no_commands_and_no_hand
     taken: set[str] = set()
 
     def look() -> bool:
-        with suppress(NodeNameNonExistentError):  # The command may not be known yet, or may just have ended.
+        # The call raises this error before the graph knows the command's node, and after the node has ended.
+        with suppress(NodeNameNonExistentError):
             taken.update(topic for topic, _ in node.get_subscriber_names_and_types_by_node(name, "/"))
         return "/left_q2r2_arm_controller/state" in taken
 

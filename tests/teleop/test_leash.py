@@ -150,8 +150,8 @@ def test_when_the_hand_comes_back_the_target_starts_at_the_tool_and_follows_the_
     tied.go(out, 900)
     farthest, held = tied.hand, tied.target
     tied.go(-0.1 * out, 200)
-    # The target is nearly where it would be if the hand's farthest pose and the tool pose were the new anchors. It is not
-    # exactly there, because the first part of the hand's return counts as tremor and has no effect.
+    # The target is nearly where it would be if the hand's farthest pose and the tool pose were the new anchors. It
+    # differs a little, because the first part of the hand's return counts as tremor and has no effect.
     motion.anchor(farthest, TOOL)
     expected = motion.target(tied.hand)
     missing = expected.actInv(tied.target)

@@ -74,7 +74,7 @@ def test_only_the_servers_own_page_may_connect(door: Door) -> None:
         assert (status(door), status(door, f"/{token}")) == (403, 200)
     else:
         assert status(door) == 200
-        # An attacker may let this name refer to this computer.
+        # An attacker can let this host name refer to the address of this computer.
         assert status(door, Host=f"example.org:{door.port}") == 403
         assert status(door, Host="example.org:9000") == 403
 

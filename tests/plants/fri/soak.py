@@ -169,7 +169,7 @@ class Soak:
             self._end_session(now)
 
     def _look_at_rest(self, now: float, held: bool, still: float) -> None:
-        """Wait until the arms have settled, or until they move faster than they may."""
+        """Wait until the arms have settled, or until they move faster than is allowed."""
         rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
         settled = passed >= rest.settled_after
         allowed = max(rest.settled if settled else rest.slow, still)

@@ -165,7 +165,7 @@ def test_an_answer_that_no_cabinet_would_follow_ends_the_session_and_the_arm_hol
     assert message.q == HOME
 
 
-def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_does_not_count() -> None:
+def test_invalid_answers_and_answers_of_a_wrong_fri_version_end_the_session_and_a_late_answer_does_not_count() -> None:
     endless, nowhere = (math.inf,) * 7, (math.nan, *HOME[1:])
     for datagram, trip in (
         (b"hello", Trip.MALFORMED),

@@ -253,7 +253,7 @@ def test_if_an_arm_begins_to_move_while_answers_are_lost_it_begins_from_rest() -
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.15
 
 
-def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
+def test_a_cabinet_that_is_silent_or_asks_for_a_wrong_kind_of_commands_is_a_fault() -> None:
     cabinet = Cabinet()
     kinds = []
     for now in (0.0, 0.3):
