@@ -238,8 +238,10 @@ def _pushed(
 ) -> Iterator[tuple[WallReport, float, float, float]]:
     """Push the left hand for 1.5 s towards the right hand, 60 mm away, and then release it for 1.5 s.
 
-    Yield at each tick the report, the sum of the energies of motion, of the wall and of the springs that hold the right
-    arm [J], the work of the push [J], and the distance of the closest pair, measured by Coal [m].
+    Yields at each tick:
+        The report on the wall, the energy [J], the work of the push [J], and the distance of the closest pair [m],
+        which Coal measures. The energy is the sum of the energies of the motion, of the wall, and of the springs that
+        hold the right arm.
     """
     q = ROBOT.home.copy()
     while min(pair.distance for pair in ROBOT.distances(q) if _of_two_arms((pair.name_a, pair.name_b))) > 0.06:

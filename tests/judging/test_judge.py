@@ -220,8 +220,10 @@ def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:
     return replace(FIGURES, **changes)
 
 
-# The columns are: the name and the value of the threshold, the group and the name of the figure that it limits, a value
-# of the figure at the limit, a value beyond the limit, and the end of the text of the reason.
+# Columns 1 and 2: the name and the value of a threshold.
+# Columns 3 and 4: the group and the name of the figure that the threshold limits.
+# Columns 5 and 6: a value of the figure at the limit, and a value beyond the limit.
+# Column 7: the end of the text of the reason.
 CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
     ("min_pose_rate", 30.0, "hand", "pose_rate_hz", 30.0, 29.0, "right hand: poses at 29.0 Hz (at least 30)"),
     ("max_dropout_share", 0.1, "hand", "dropout_share", 0.1, 0.2, "dropouts 20.0 % of the time (at most 10)"),

@@ -210,9 +210,7 @@ def test_after_a_blow_an_arm_keeps_the_bounds_of_its_torques_and_comes_back(bare
 
 
 def test_a_held_mass_that_the_controller_knows_causes_no_sag_and_no_jump_of_torques(bare_config: Config) -> None:
-    """A mass of 2 kg at the tool's point causes a sag of 9.8 mm at 2000 N/m, as long as the controller does not know
-    the mass.
-    """
+    """A mass of 2 kg at the tool frame causes a sag of 9.8 mm at 2000 N/m if the controller does not know the mass."""
     data = bare_config.model_dump()
     data["arms"]["left"]["gripper"]["object"] = {"mass": 2.0}
     config = Config.model_validate(data)

@@ -16,9 +16,9 @@ from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
 def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
-    """Return the data of the certificate before it examines pairs, and h + T / 2 [s].
+    """Return the data that the certificate has before it examines pairs, and the time h + T / 2 [s].
 
-    h is the duration of the step, and T is the duration of the stop.
+    The step takes h, and the stop takes T.
     """
     model, data = kernel_model(name).safety, reused_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
