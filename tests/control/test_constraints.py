@@ -34,7 +34,7 @@ class StillJoint:
 
 
 class Answers:
-    """A constraint that returns whatever ``answer`` returns once ``asked`` is True. Before, it returns no rows."""
+    """A constraint that returns whatever ``answer`` returns once ``asked`` is True. Before that, it returns no rows."""
 
     def __init__(self, answer: Callable[[int], Any], hard: bool = False) -> None:
         self.answer, self.hard, self.asked = answer, hard, False

@@ -43,7 +43,7 @@ class Client:
 
 
 def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Monitoring:
-    """Let the client answer for ``periods`` periods. Return the next message."""
+    """Let the client answer for ``periods`` periods. Return the message that follows."""
     for period in range(periods):
         message = cabinet.send(period * cabinet.settings.period)
         if (command := answer(message)) is not None:

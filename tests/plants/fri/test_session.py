@@ -101,7 +101,7 @@ def test_a_torque_that_is_not_updated_is_replaced_by_a_braking_torque_and_later_
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
 
 
-def test_a_braking_torque_changes_at_most_by_the_rate_limit_or_by_5000_nm_s_if_the_limit_is_lower() -> None:
+def test_a_braking_torque_changes_no_faster_than_the_rate_limit_which_counts_as_at_least_5000_nm_s() -> None:
     for rate, change in ((6000.0, 30.0), (100.0, 25.0)):
         cabinet = torque_cabinet(rate=rate)
         active, still, ones = begin_torques(cabinet), (0.0,) * 7, (1.0,) * 7
