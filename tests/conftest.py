@@ -20,8 +20,9 @@ settings.load_profile("repeatable")
 def pytest_collection_finish() -> None:
     """Freeze imported objects. Otherwise, each run of a pipeline would spend 0.2 s on the collection of garbage.
 
-    Each run asks for the number of frozen objects. Python would count them each time, for 20 ms or longer. A function
-    that returns the first count therefore replaces Python's own function, which is its attribute ``__wrapped__``.
+    Each run asks for the number of frozen objects. Python would count them each time, for 20 ms or longer. Therefore a
+    function that returns the first count replaces Python's own function. Its attribute ``__wrapped__`` is the function
+    that it replaces.
     """
     gc.collect()
     gc.freeze()

@@ -128,7 +128,7 @@ def test_the_demo_succeeds_without_any_optional_subpackage() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("door", DOORS)
 def test_a_demo_runs_to_its_judge_without_one_optional_subpackage(door: str) -> None:
-    """Another optional subpackage that is still there may need the missing one. The demo is too short to succeed."""
+    """One of the remaining optional subpackages might need the missing one. The demo is too short to succeed."""
     command = ("demo", "grasp", "--fast", "--headless", "--duration", "0.1", "--json")
     (result,) = results([command], without=(f"q2r2_control.{door}",))
     assert result.code == 1, result.stderr

@@ -108,7 +108,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     ]  # Importing a module also imports its package, so packages are left out.
     known = {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in files}
     graph = {name: imported_by(file) & known.keys() for name, file in known.items()}
-    TopologicalSorter(graph).prepare()  # A circle would raise CycleError.
+    TopologicalSorter(graph).prepare()  # This call raises CycleError if modules import each other in a circle.
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
     ],
 )
 def test_importing_a_light_module_imports_nothing_heavy(modules_and_forbidden: dict[str, tuple[str, ...]]) -> None:
-    """One process imports modules one after the other: a module that imports too much is the first with an entry."""
+    """One process imports the modules one after the other. The first entry names the module that imports too much."""
     if "ros.bridge.parameters" in modules_and_forbidden and find_spec("rclpy") is None:
         pytest.skip("rclpy is not installed")
     code = f"""

@@ -130,7 +130,8 @@ def test_a_type_checker_finds_each_name_in_the_module_that_a_program_imports(pac
 
 
 def test_importing_the_public_packages_imports_nothing_that_their_names_need() -> None:
-    packages = ", ".join(package for package in PACKAGES if package != f"{PACKAGE}.gym")  # Gymnasium imports numpy.
+    # The package gym is left out, because Gymnasium imports numpy.
+    packages = ", ".join(package for package in PACKAGES if package != f"{PACKAGE}.gym")
     code = f"import sys, {packages}; print(*(name for name in {HEAVY!r} if name in sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

@@ -80,7 +80,7 @@ def test_after_a_stall_no_joint_moves_farther_between_two_commands_than_its_limi
     assert largest_step(plant, loop.robot.velocity_limit) <= 1.0 + 1e-9
     paused = [event for event in summary.events if event.destination == "lost"]
     assert bool(paused) == (stall > loop.config.teleop.gate.timeout), "a long stall pauses, a short one does not"
-    expected = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent")  # Only these reasons may pause an arm.
+    expected = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent")  # An arm must not pause for other reasons.
     assert all(event.reason.root.kind in expected for event in paused)
 
 

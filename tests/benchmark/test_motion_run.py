@@ -33,7 +33,7 @@ SHORT = replace(
 
 
 class Standing:
-    """A controller that stands still, except for one joint in one tick, and that has no solution in another tick."""
+    """A controller that stands still. On request, a joint moves in one tick, and one tick has no solution."""
 
     name, limitations = "standing", "everything"
 
@@ -128,10 +128,10 @@ def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: 
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # The nearest pair, a finger and an obstacle, keeps 1 mm.
+    assert ours.min_distance_mm >= 1.0  # The nearest pair, a finger and an obstacle, has to keep a distance of 1 mm.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
-    # The target is 10 mm lower than the table allows.
+    # In the cell, the table keeps the tool 10 mm above its target.
     assert row.free_air.rms_error_mm < 2.0 < 9.0 < ours.rms_error_mm
     assert ours.times_us is not None
     assert list(ours.times_us) == sorted(ours.times_us)
@@ -147,7 +147,7 @@ def test_the_target_that_a_peer_gets_is_ahead_by_its_speed_divided_by_the_gain()
         pose = pin.SE3(pin.exp3(tick * turn), np.array([0.0004 * tick, 0.0, 0.1]))
         leading.step({"left": pose}, 0.001)
     assert peer.given[0].isApprox(pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1])), 1e-15)
-    # The target is ahead by an eighth of a second at 0.4 m/s and 1 rad/s.
+    # The target moves at 0.4 m/s and 1 rad/s. In an eighth of a second, it moves by 0.05 m and 0.125 rad.
     np.testing.assert_allclose(peer.given[2].translation, [0.0008 + 0.05, 0.0, 0.1], atol=1e-12)
     np.testing.assert_allclose(pin.log3(peer.given[2].rotation), [0.0, 0.0, 0.002 + 0.125], atol=1e-12)
     assert (leading.hold()[0] == 1.0).all()

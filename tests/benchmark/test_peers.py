@@ -70,7 +70,7 @@ def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_our_controller(pe
 
 
 @pytest.mark.slow
-def test_a_peer_follows_in_free_motion_as_well_as_its_gain_allows(peer: BenchController) -> None:
+def test_in_free_motion_a_peer_follows_its_target_as_closely_as_its_gain_allows(peer: BenchController) -> None:
     figures = run_motion(Leading(peer, CONFIG.control.position_gain), ROBOT, WORK_MOTIONS["reach-under"])
     # Without Leading, the tool would be 35 mm behind its target, which moves at 0.28 m/s.
     assert figures.max_error_mm is not None

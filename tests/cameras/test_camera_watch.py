@@ -65,7 +65,7 @@ def test_a_slow_camera_is_reported_once_and_again_only_after_it_was_fast_enough(
     assert len(told(watched, every(0.1, 12.0, 16.0))) == 1
 
 
-def test_pictures_of_another_size_are_reported_once() -> None:
+def test_pictures_that_do_not_have_the_configured_size_are_reported_once() -> None:
     watched = watch()
     told(watched, every(0.05, 0.0, 1.0))
     assert told(watched, every(0.05, 1.0, 2.0), width=32) == ["camera front: pictures of 32x48; allowed: 64x48"]

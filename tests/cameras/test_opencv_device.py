@@ -87,7 +87,7 @@ def test_the_capture_time_of_a_network_cameras_picture_is_its_receipt_minus_the_
         assert Stream.sent[number] - delay <= shot.time <= received - delay
 
 
-def test_a_network_camera_of_another_size_is_refused(address: str) -> None:
+def test_a_network_camera_whose_pictures_do_not_have_the_configured_size_is_refused(address: str) -> None:
     with pytest.raises(CameraError, match=f"allowed: width: {WIDTH}, height: {HEIGHT}"):
         open_device(CameraConfig(device=address, width=WIDTH, height=2 * HEIGHT))
 

@@ -1,7 +1,7 @@
-"""The formats of V4L2 devices are read in the structures of the kernel's <linux/videodev2.h>.
+"""The formats of V4L2 devices are read from the structures of the kernel's <linux/videodev2.h>.
 
 The computers that run the tests have no camera, so a function answers instead of a driver. It builds the same
-structures with ctypes, whose fields have names. The test therefore finds a number at a wrong offset.
+structures with ctypes, whose fields have names. If the code reads a number at a wrong offset, the test therefore fails.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class FrameSize(ctypes.Structure):
         ("type", ctypes.c_uint32),
         ("width", ctypes.c_uint32),
         ("height", ctypes.c_uint32),
-        ("others", ctypes.c_uint32 * 4),  # The other numbers of a range of sizes.
+        ("others", ctypes.c_uint32 * 4),  # Further numbers that only a range of sizes has.
         ("reserved", ctypes.c_uint32 * 2),
     )
 

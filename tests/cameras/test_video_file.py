@@ -63,7 +63,7 @@ def test_the_rotation_of_a_camera_turns_its_pictures_clockwise(tmp_path: Path) -
         ({"rotation": 90}, "gives no 64x48; the nearest that it gives is 48x64; allowed: width: 48, height: 64"),
     ],
 )
-def test_the_error_for_a_video_of_another_size_names_the_size_of_the_video(
+def test_the_error_for_a_video_that_does_not_have_the_configured_size_names_the_size_of_the_video(
     tmp_path: Path, changes: dict[str, object], says: str
 ) -> None:
     with pytest.raises(CameraError, match=says):

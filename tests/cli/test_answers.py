@@ -58,7 +58,9 @@ def test_answers_in_a_damaged_file_or_in_a_file_about_another_subject_are_not_of
     assert seen == [0.1]
 
 
-def test_an_answer_of_another_type_is_not_offered(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_whose_type_does_not_fit_its_question_is_not_offered(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file.write_text('{"about": {"left": "iiwa7"}, "answers": {"height": "high"}}')
     seen = offered(monkeypatch, None)
     assert RememberedAnswers(file, ABOUT).ask("height", 0.1) == 0.1

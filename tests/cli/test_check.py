@@ -73,7 +73,7 @@ def test_check_refuses_arms_that_a_run_refuses(tmp_path: Path, pattern: str, new
         ("home: [", "home: [0.1, ", "home"),
     ],
 )
-def test_check_names_both_arms_if_both_have_the_fault(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_check_names_both_arms_if_both_have_the_same_fault(tmp_path: Path, old: str, new: str, fault: str) -> None:
     (file := tmp_path / "cell.yaml").write_text(find_resource(CELL).read_text(encoding="utf-8").replace(old, new))
     checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--fast", "--headless", "--duration", "0.1")
     assert (checked.exit_code, ran.exit_code) == (2, 2)
@@ -269,7 +269,8 @@ def test_if_a_fault_says_that_limits_are_in_degrees_no_note_asks_for_the_units_o
     limits = {joint.get("name"): limit for joint in urdf.findall("joint") for limit in joint.findall("limit")}
     for name in ("A3", "A4"):
         limits[name].attrib.update(lower="-120", upper="120", velocity="130")
-    limits["A5"].set("velocity", "130")  # The range is in radians, so only the user knows the unit.
+    # The position limits of A5 are in radians. Only the user knows whether its velocity limit is in degrees.
+    limits["A5"].set("velocity", "130")
     (tmp_path / "arm.urdf").write_text(ET.tostring(urdf, encoding="unicode"))
     report = check_cell(one_arm(model=str(tmp_path / "arm.urdf")))
     assert [fault.partition(":")[0] for fault in report.faults] == ["left_A3, left_A4"]

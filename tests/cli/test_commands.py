@@ -54,7 +54,7 @@ def test_the_example_of_a_command_is_in_its_help_and_its_options_exist(command: 
     assert f"Example: {command.example}\n" in q2r2(command.name, "--help").stdout
     program, name, *arguments = shlex.split(command.example)
     assert (program, name) == ("q2r2", command.name)
-    loaded.make_context(name, arguments)  # An unknown option would raise here.
+    loaded.make_context(name, arguments)  # An unknown option would raise an error here.
 
 
 def test_the_help_has_every_command_once_under_the_heading_of_its_group() -> None:

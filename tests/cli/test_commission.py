@@ -116,7 +116,7 @@ def test_a_cell_that_passes_all_steps_is_signed_off_and_may_run(
     for load in kept["steps"]["load"]:
         assert load["identified_kg"] == pytest.approx(load["expected_kg"], abs=0.01)
     after = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere")
-    assert "nowhere" in after.stderr  # The run was allowed, and ended at this wrong option.
+    assert "nowhere" in after.stderr  # The cell was allowed to run. The run ended only because of this wrong option.
     assert "joints at a tenth of their speed" in after.stderr
     assert "a tenth" not in q2r2("run", str(cell), "--trajectory", "nowhere", "--full-speed").stderr
     cell.write_text(cell.read_text(encoding="utf-8").replace("192.0.2.1", "192.0.2.2"), encoding="utf-8")

@@ -91,7 +91,9 @@ def test_a_page_that_cannot_be_written_is_refused_before_recordings_are_read(tmp
     assert [file.name for file in tmp_path.iterdir()] == ["file"], "the check leaves nothing behind"
 
 
-def test_a_file_that_cannot_be_read_is_discarded_and_the_others_are_judged(recordings: Path, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_discarded_and_the_other_files_are_judged(
+    recordings: Path, tmp_path: Path
+) -> None:
     (tmp_path / "empty.mcap").touch()
     why = f"{tmp_path / 'empty.mcap'}: discard: unreadable, "
     result = q2r2("judge", str(tmp_path), str(recordings))
@@ -123,7 +125,8 @@ class TestARunThatIsRecorded:
         assert written["episodes"] == [episode]
         again = one_object(q2r2("judge", str(tmp_path), "--json").stdout)["episodes"]
         assert again == [episode]
-        with AnyReader([kept.parent]) as bag:  # The file can still be read.
+        # Other programs can still read the recording, although the verdict is in the same folder.
+        with AnyReader([kept.parent]) as bag:
             assert bag.message_count > 0
 
     def test_the_verdict_is_printed_as_one_line_before_the_figures(self, tmp_path: Path) -> None:

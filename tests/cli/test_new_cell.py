@@ -72,7 +72,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(m
 
 
 @pytest.mark.slow
-def test_a_fault_names_the_links_without_masses_and_a_line_says_that_these_masses_are_left_to_do() -> None:
+def test_a_fault_names_the_links_without_masses_and_a_line_says_that_this_fault_is_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1

@@ -33,7 +33,9 @@ def test_a_replay_without_a_difference_prints_identical_and_exits_with_0(recorde
         assert (result.exit_code, result.stdout, result.stderr) == (0, "identical\n", "")
 
 
-def test_with_another_cell_replay_prints_the_differences_and_exits_with_1(recorded: Path, tmp_path: Path) -> None:
+def test_with_a_cell_that_differs_from_the_recorded_cell_replay_prints_the_differences_and_exits_with_1(
+    recorded: Path, tmp_path: Path
+) -> None:
     other = changed_cell(tmp_path, "position_scale: 1.0 ", "position_scale: 1.5 ")
     result = q2r2("replay", str(recorded), "--compare", "--config", other)
     assert result.exit_code == 1
@@ -42,7 +44,7 @@ def test_with_another_cell_replay_prints_the_differences_and_exits_with_1(record
     assert "teleop.position_scale: 1.0 when recorded, now 1.5" in result.stderr
 
 
-def test_on_another_plant_replay_prints_the_distances_of_the_tools(recorded: Path) -> None:
+def test_on_a_plant_that_was_not_the_plant_of_the_run_replay_prints_the_distances_of_the_tools(recorded: Path) -> None:
     data = one_object(q2r2("replay", str(recorded), "--plant", "mujoco", "--json").stdout)
     assert data["ticks"] == data["summary"]["ticks"] > 1000
     assert data["ended_by"] is None

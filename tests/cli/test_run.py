@@ -169,7 +169,7 @@ CAMERAS = ["above", "left_wrist", "right_wrist"]
         pytest.param(("--web",), True, True, (False, ("127.0.0.1", 8080, None)), id="a page is asked for"),
     ],
 )
-def test_a_demo_at_a_terminal_shows_the_arms_if_this_is_possible(
+def test_a_demo_at_a_terminal_shows_the_arms_in_a_window_or_on_a_page_if_one_of_them_is_possible(
     monkeypatch: pytest.MonkeyPatch,
     options: tuple[str, ...],
     display: bool,

@@ -164,7 +164,9 @@ class TestAnImpedanceThatChanges:
             assert controller.in_force("right") == before
         assert controller.in_force("left") == asked
 
-    def test_another_change_starts_from_the_present_value_and_does_not_affect_other_changes(self, robot: Robot) -> None:
+    def test_a_second_change_of_a_setting_starts_from_its_present_value_and_affects_no_other_change(
+        self, robot: Robot
+    ) -> None:
         controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         controller.change({"damping_ratio": 0.5, "nullspace_stiffness": 10.0})
         for ticks, damping in ((50, None), (50, [1.25, 0.5]), (50, [1.75, 0.5])):

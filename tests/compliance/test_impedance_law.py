@@ -75,7 +75,9 @@ class TestLimitRepulsion:
         assert np.ptp(torques) == 0
         return float(torques[0])
 
-    def test_the_limit_torque_is_a_spring_that_starts_0_1_rad_before_the_limit_or_at_a_nearer_reference(self) -> None:
+    def test_the_limit_torque_is_a_spring_that_starts_0_1_rad_before_the_limit_or_at_a_reference_nearer_to_it(
+        self,
+    ) -> None:
         assert [self.torque(q) for q in (-0.9, 0.0, 0.9)] == [0.0, 0.0, 0.0]
         assert [self.torque(q) for q in (0.95, -0.95, 1.1)] == pytest.approx([-15.0, 15.0, -60.0])
         assert [self.torque(q, wanted=0.97) for q in (0.97, 0.98)] == pytest.approx([0.0, -3.0])

@@ -112,7 +112,7 @@ def test_in_the_report_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_
     assert not any("finger" in name for name in report.closest_pair)
 
 
-def test_the_wall_uses_the_bodies_of_fingers_for_the_openings_that_were_set() -> None:
+def test_after_openings_are_set_the_wall_uses_the_finger_bodies_for_these_openings() -> None:
     random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
     closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
     farther = 0
@@ -238,8 +238,10 @@ def _pushed(
 ) -> Iterator[tuple[WallReport, float, float, float]]:
     """Push the left hand for 1.5 s towards the right hand, 60 mm away, and then release it for 1.5 s.
 
-    Yield at each tick the report, the sum of the energies of motion, of the wall and of the springs that hold the right
-    arm [J], the work of the push [J], and the distance of the closest pair, measured by Coal [m].
+    Yields at each tick:
+        The report on the wall, the energy [J], the work of the push [J], and the distance of the closest pair [m],
+        which Coal measures. The energy is the sum of the energies of the motion, of the wall, and of the springs that
+        hold the right arm.
     """
     q = ROBOT.home.copy()
     while min(pair.distance for pair in ROBOT.distances(q) if _of_two_arms((pair.name_a, pair.name_b))) > 0.06:

@@ -50,7 +50,7 @@ def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iter
 class TestTheShippedCellShowsAllThereIsToTune:
     # Keys whose value differs from the default. A comment in the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    # Blocks that may lack keys, because another block of the same kind lists all keys, such as an arm's mount.
+    # Keys that may be missing here, because another block of the same kind or the other text of the test shows them.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
 
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])

@@ -108,7 +108,7 @@ def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> 
 
 
 def reused_data(name: str, q: Array, v: Array | None = None) -> KernelData:
-    """Return what :func:`kernel_data` returns, but write it into the data that the last call for this cell returned.
+    """Return what :func:`kernel_data` returns. The data that an earlier call for this cell returned are overwritten.
 
     A test that needs the data of one state at a time saves most of its time in this way.
     """

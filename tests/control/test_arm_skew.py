@@ -117,7 +117,9 @@ def test_an_undone_step_leaves_the_history_of_the_reference_unchanged(robot: Rob
         np.testing.assert_array_equal(array, kept)
 
 
-def test_the_skew_grows_with_time_to_a_longer_allowed_value_and_falls_at_once_to_a_shorter_value(robot: Robot) -> None:
+def test_if_a_longer_skew_is_allowed_the_skew_grows_with_time_and_if_a_shorter_skew_is_allowed_it_falls_at_once(
+    robot: Robot,
+) -> None:
     controller = CartesianController(robot)
     controller.allow_skew(0.02)
     assert controller.skew == 0.0

@@ -34,7 +34,7 @@ class StillJoint:
 
 
 class Answers:
-    """A constraint that returns whatever ``answer`` returns once ``asked`` is True. Before, it returns no rows."""
+    """A constraint that returns whatever ``answer`` returns once ``asked`` is True. Before that, it returns no rows."""
 
     def __init__(self, answer: Callable[[int], Any], hard: bool = False) -> None:
         self.answer, self.hard, self.asked = answer, hard, False
@@ -197,7 +197,7 @@ def test_if_the_certified_part_of_a_solution_violates_a_hard_row_the_certified_s
 
 
 @pytest.mark.parametrize("name", [name for name in ("clarabel", "quadprog") if name in qpsolvers.available_solvers])
-def test_other_solvers_keep_a_hard_row_too(robot: Robot, name: str) -> None:
+def test_solvers_other_than_daqp_also_keep_a_hard_row(robot: Robot, name: str) -> None:
     controller = CartesianController(robot, constraints=[StillJoint(3, hard=True)])
     stops = 0
     for tick in range(100):
@@ -250,7 +250,7 @@ def test_a_task_that_raises_an_exception_in_a_step_changes_nothing_and_is_named_
 
 
 class NothingToKeep:
-    """A constraint whose only row every velocity satisfies."""
+    """A constraint with a single row, which every velocity satisfies."""
 
     hard = True
 

@@ -215,7 +215,7 @@ def test_a_controller_that_starts_with_an_unproven_stop_has_no_certificate_until
     for speed in np.arange(0.5, 1.0, 5e-4):
         controller.reset(q + 0.3 * turn, speed * turn)
         if not controller.step({}, 0.0).report.certified:
-            break  # The start is a little too fast.
+            break  # At this speed, the arms start a little too fast for a certified stop.
     solver.fault = "none"
     reports = [controller.step({}, 0.001).report for _ in range(5)]
     assert not any(report.certified for report in reports)

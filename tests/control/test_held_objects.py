@@ -1,6 +1,6 @@
-"""A held object is monitored. Its pairs keep their present distances at first, and greater distances when they open.
+"""A held object is monitored. When it is gripped, each of its pairs keeps the distance that the pair has.
 
-No arm moves because an object is gripped.
+No arm therefore moves because an object is gripped. When a pair opens, it keeps a greater distance.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
         reference = run.drive(DT, {"left": at(GRIP + 0.02)})
         distances = object_distances(controller, reference.q)
         spare = distances - controller.object_distances
-        if distances[spare.argmin()] > 0.0:  # Coal measures the depth of a penetration in another way.
+        # In a penetration, Coal measures the depth in another way than the controller, so it is not compared.
+        if distances[spare.argmin()] > 0.0:
             assert reference.report.margin == pytest.approx(spare.min(), abs=2e-6)
             grown += int(counting(controller).min() > kept)
         kept = counting(controller).min()
@@ -128,7 +129,8 @@ def test_an_object_that_is_gripped_in_motion_keeps_its_new_distances_during_the_
         moving = np.minimum(time, np.abs(reference.v) / stop)
         q = reference.q + reference.v * moving - 0.5 * np.sign(reference.v) * stop * moving**2
         values = object_distances(controller, q)
-        seen = counts & (values > 0.0)  # Coal measures the depth of a penetration in another way.
+        # In a penetration, Coal measures the depth in another way than the controller, so it is not compared.
+        seen = counts & (values > 0.0)
         assert (values - kept)[seen].min() > -2e-6
         assert (kept[counts & (values <= 0.0)] < 0.0).all()
     for _ in range(500):
@@ -213,7 +215,8 @@ def test_if_a_step_is_undone_the_kept_distances_of_a_held_block_are_those_before
         grown += bool((counting(controller) > before[np.isfinite(before)]).any())
         controller.withdraw(late)
         np.testing.assert_array_equal(controller.object_distances, before)
-        apart = distances > 0.0  # Coal measures the depth of a penetration in another way.
+        # In a penetration, Coal measures the depth in another way than the controller, so it is not compared.
+        apart = distances > 0.0
         assert (distances[apart] >= controller.object_distances[apart] - 1e-6).all()
         assert controller.step(lifted, DT).report.certified
     assert grown > 10

@@ -1,4 +1,4 @@
-"""Targets that come less often than steps are interpolated. Other targets are passed on as they are."""
+"""Targets that come less often than steps are interpolated. All other targets are passed on unchanged."""
 
 from __future__ import annotations
 

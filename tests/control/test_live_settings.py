@@ -230,7 +230,7 @@ def test_a_min_distance_is_refused_with_the_name_of_the_pair_if_the_home_posture
     controller: CartesianController,
 ) -> None:
     nearest = min(controller.robot.distances(controller.robot.home), key=lambda pair: pair.distance)
-    # Home would keep this distance, but not together with distance_buffer.
+    # At home, the pair has this distance, but it does not have this distance plus distance_buffer.
     refusal = controller.change({"min_distance": nearest.distance - 0.001})
     assert refusal is not None
     assert nearest.name_a in refusal

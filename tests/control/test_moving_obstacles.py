@@ -1,4 +1,7 @@
-"""Obstacles that move on their own. Arms come to rest before an obstacle can touch them, and can work beside it."""
+"""Obstacles that move on their own. Arms come to rest before an obstacle can touch them, and can work beside it.
+
+In this file, a hand is such an obstacle, for example the hand of a person beside the arms.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +116,7 @@ def test_when_reports_on_an_obstacle_end_the_arms_come_to_rest_and_the_controlle
 def test_if_a_hand_is_no_longer_reported_an_arm_moves_only_where_the_hand_cannot_have_arrived(
     controller: CartesianController,
 ) -> None:
-    """The target leads away from the obstacle. As long as reports come, the arm may move there."""
+    """The target is on the side away from the obstacle. The arm could reach the target if reports went on."""
     start, speed = controller.tool_pose("left"), 0.3
     reported, goal = start.translation + np.array([0.0, 0.4, 0.0]), start.translation - np.array([0.0, 0.3, 0.0])
     coal_distances, back, moved = Coal(controller), np.array([0.0, 1.0, 0.0]), 0.0

@@ -19,7 +19,8 @@ from tests.control.scenarios import circle
 from tests.support.driven import Driven
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
+# The solver has no time limit, so that no result depends on the speed of the computer.
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})
 TABLE = 0.2  # Height of the table's top [m].
 FRAME_TO_TIPS = 0.013  # Distance from the tool frame to the finger tips [m].
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
@@ -125,7 +126,7 @@ def test_joint_accelerations_hardly_jump_while_arms_slide_along_each_other(
     }
     v = np.array([controller.step(targets, dt).v for _ in range(4000)])
     assert np.linalg.norm(v[started:], axis=1).min() > 0.05, "they slide all the time"
-    # When a pair begins to hold the arms back, an acceleration may still jump.
+    # A jump is allowed in one of 100 ticks, for example when a pair begins to hold the arms back.
     assert count_jolts(v, dt, started * dt) <= 0.01 * 2000, f"changes of more than {JOLT:g} rad/s^2"
 
 

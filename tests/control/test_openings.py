@@ -161,7 +161,7 @@ class Cell(Driven):
     """A run that checks the contract, and measures distances with the real positions of the fingers."""
 
     def __init__(self, config: Config) -> None:
-        # No result depends on the clock.
+        # The solver has no time limit, so that no result depends on the speed of the computer.
         robot, settings = Robot.from_config(config), config.control.model_copy(update={"solve_time_limit": None})
         self.real, self.kept = RealHands(robot), kept_distances(robot, settings).values
         super().__init__(CartesianController(robot, settings), dt=DT)
@@ -244,7 +244,7 @@ def test_with_hostile_targets_and_openings_no_finger_is_too_close_at_its_real_po
             interval = ((low, high), (low, 1.0), (0.0, high), ALL_OF_THE_WAY)[random.integers(4)]
             stop = cell.controller.stop_deceleration
             refused += cell.set_opening(str(random.choice(["left", "right"])), *interval) is not None
-            # The arms may already be braking along this stop, so it must not change.
+            # The arms possibly brake along this stop already, so the stop must not change.
             np.testing.assert_array_equal(cell.controller.stop_deceleration, stop)
         cell.drive(DT, goals)
         if tick % 8 == 0:

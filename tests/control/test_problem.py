@@ -33,7 +33,7 @@ def crossing(robot: Robot, tick: int = 0) -> dict[str, pin.SE3]:
 
 
 def same(one: Reference, other: Reference) -> bool:
-    """Return whether two references and their reports are equal to the bit. Only the solve times may differ."""
+    """Return whether two references and their reports are equal to the bit. The solve times are not compared."""
     arrays = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in "qva")
     return arrays and replace(one.report, solve_time=0.0) == replace(other.report, solve_time=0.0)
 

@@ -43,7 +43,8 @@ def test_after_an_undone_step_no_pair_keeps_a_greater_distance_than_before_the_s
     controller.step({}, DT)
     assert controller.change({"min_distance": controller.settings.min_distance + 0.01}) is None
     before, late = controller.kept_distances, controller.step({}, DT)
-    while not (controller.kept_distances > before).any():  # Kept distances do not grow at every step.
+    # Kept distances do not grow at every step. The loop ends at a step in which one of them grew.
+    while not (controller.kept_distances > before).any():
         before, late = controller.kept_distances, controller.step({}, DT)
     controller.withdraw(late)
     np.testing.assert_array_equal(controller.kept_distances, before)

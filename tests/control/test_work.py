@@ -14,7 +14,8 @@ from tests.support.driven import Driven
 pytestmark = pytest.mark.slow
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
+# The solver has no time limit, so that no result depends on the speed of the computer.
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})
 # Time after the motion in which the arms come to rest [s]. Arms that block each other first slide along each other.
 STILL = 3.0
 

@@ -59,7 +59,7 @@ def trials_of(demo: subprocess.Popen[str]) -> list[int]:
     """Return the processes of the demo that have begun a trial."""
     trials = []
     for pid, folder in ((pid, Path(f"/proc/{pid}")) for pid in children(demo.pid)):
-        with suppress(OSError):  # A process may have ended meanwhile, such as a command that a library calls.
+        with suppress(OSError):  # Some processes end before this line, for example commands that a library calls.
             if b"spawn_main" in (folder / "cmdline").read_bytes() and "libmujoco" in (folder / "maps").read_text():
                 trials.append(pid)
     return trials

@@ -1,4 +1,4 @@
-"""A leader arm with the joints of an SO-101, and the pose of its tool by hand."""
+"""A leader arm with the joints of an SO-101, and the position of its tool from formulas that need no URDF."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 _AXES = ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "1 0 0")
-UPPER, LOWER = 0.3, 0.2  # Lengths of the links behind the lift and behind the elbow, which lie along x at zero [m].
+UPPER, LOWER = 0.3, 0.2  # Length of the link from the lift to the elbow, and from the elbow to the wrist [m].
 RANGE = math.pi / 2.0  # Each joint turns from minus to plus this angle [rad].
 
 
 def write_urdf(folder: Path) -> Path:
-    """Write the URDF. The tool is 0.5 m before the base if all joints are at zero."""
+    """Write the URDF. If all joints are at zero, the tool is 0.5 m in front of the base, along its x."""
     offsets = {"elbow_flex": UPPER, "wrist_flex": LOWER}
     limit = f'<limit lower="{-RANGE}" upper="{RANGE}" effort="1" velocity="1"/>'
     parts, parent = ['<link name="base"/>'], "base"

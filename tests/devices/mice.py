@@ -1,4 +1,4 @@
-"""SpaceMice in place of hidapi's devices. They give the bytes of real HID reports."""
+"""Simulated SpaceMice, which tests use instead of hidapi's devices. They give the bytes of real HID reports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FULL = 350  # Reading of an axis at full deflection.
 
 
 def translation(right: int = 0, back: int = 0, down: int = 0) -> bytes:
-    """Return report 1 of a model that sends translation and rotation separately."""
+    """Return the HID report 1 of a SpaceMouse model that sends translation and rotation in separate reports."""
     return struct.pack("<B3h", 1, right, back, down)
 
 
@@ -21,7 +21,7 @@ def rotation(about_right: int = 0, about_back: int = 0, about_down: int = 0) -> 
 
 
 def both(*axes: int) -> bytes:
-    """Return report 1 of a model that sends all six axes in 12 bytes."""
+    """Return the HID report 1 of a SpaceMouse model that sends all six axes in the 12 bytes of one report."""
     return struct.pack("<B6h", 1, *axes)
 
 
@@ -30,7 +30,7 @@ def buttons(left: bool = False, right: bool = False) -> bytes:
 
 
 class Mouse:
-    """One SpaceMouse, which can be unplugged. ``send`` returns when the reader has taken a report."""
+    """One SpaceMouse, which can be unplugged. ``send`` returns when the reader has taken all reports."""
 
     def __init__(self, path: str, serial: str = "", usage: tuple[int, int] = (1, 8)) -> None:
         self.info = {
@@ -63,7 +63,7 @@ class Mouse:
 
 
 class Hid:
-    """hidapi's module with some mice."""
+    """A replacement for hidapi's module, which finds the given mice."""
 
     def __init__(self, *mice: Mouse) -> None:
         self.mice = mice
@@ -76,7 +76,7 @@ class Hid:
 
 
 class Opened:
-    """hidapi's ``device``."""
+    """A replacement for hidapi's class ``device``, with which a program opens a mouse."""
 
     def __init__(self, hid: Hid) -> None:
         self._hid = hid
@@ -88,6 +88,6 @@ class Opened:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for a thread, however long it takes."""
+    """Wait until ``condition`` holds. There is no timeout, because another thread may take long."""
     while not condition():
         threading.Event().wait(0.001)

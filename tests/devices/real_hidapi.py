@@ -1,6 +1,7 @@
-"""Read reports through the real hidapi, from a pseudo-terminal in place of /dev/hidraw. Prints what the hand does.
+"""Read reports through the real hidapi, from a pseudo-terminal instead of /dev/hidraw, and print what the hand does.
 
-No computer of the tests has a SpaceMouse, and their kernels cannot simulate one. Only the list of devices is replaced.
+No computer that runs the tests has a SpaceMouse, and its kernel cannot simulate one. Of hidapi, only the list of
+devices is replaced.
 """
 
 from __future__ import annotations
@@ -40,10 +41,11 @@ class Terminal:
 def wait_for(
     source: SpaceMouseInput, fits: Callable[[HandSample], bool], act: Callable[[], None] = lambda: None
 ) -> None:
-    """Poll until a sample fits. Before each poll, ``act``."""
+    """Poll until ``fits`` is True for a sample. Call ``act`` before each poll."""
     while True:
         act()
-        time.sleep(0.02)  # A terminal has no borders of reports, so the reader has to take one before the next.
+        # A terminal does not separate reports, so the reader has to take each report before the next one is sent.
+        time.sleep(0.02)
         if any(map(fits, source.poll(time.monotonic()))):
             return
 

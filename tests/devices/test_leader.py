@@ -1,4 +1,4 @@
-"""Leader arms: positions of joints, in degrees or as a part of their range, give the pose of a hand."""
+"""Leader arms: the pose of a hand is computed from joint positions, in degrees or as percentages of their ranges."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def arm(folder: Path, names: list[str] = NAMES, **settings: Any) -> LeaderArm:
         ),
     ],
 )
-def test_positions_of_joints_give_the_place_of_the_tool(
+def test_the_position_of_the_tool_is_computed_from_the_positions_of_the_joints(
     tmp_path: Path, settings: dict[str, Any], action: dict[str, float], angles: dict[str, float]
 ) -> None:
     position, quaternion = arm(tmp_path, **settings).tool(AT_ZERO | action)
@@ -84,7 +84,7 @@ def test_a_leader_that_does_not_fit_its_urdf_is_refused(
         arm(tmp_path, names, **settings)
 
 
-def test_a_joint_without_limits_needs_degrees(tmp_path: Path) -> None:
+def test_a_joint_without_limits_is_refused_unless_its_position_is_in_degrees(tmp_path: Path) -> None:
     text = write_urdf(tmp_path).read_text()
     (other := tmp_path / "other.urdf").write_text(text.replace(f'upper="{math.pi / 2.0}"', f'upper="{-math.pi / 2.0}"'))
     assert arm(tmp_path, urdf=str(other)).tool(AT_ZERO)

@@ -1,4 +1,4 @@
-"""The pedal reads the kernel's event structures, here from a named pipe in place of the event device."""
+"""The pedal reads the kernel's event structures. In these tests, a named pipe replaces the event device."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_pedal_is_held_from_its_press_to_its_release(pedal: tuple[Pedal, int])
     os.close(writer)
 
 
-def test_a_pedal_that_is_gone_raises(pedal: tuple[Pedal, int]) -> None:
+def test_reading_a_pedal_that_was_removed_raises_an_error(pedal: tuple[Pedal, int]) -> None:
     device, writer = pedal
     os.write(writer, events((KEY_B, DOWN)))
     os.close(writer)
@@ -59,10 +59,13 @@ def test_a_pedal_that_is_gone_raises(pedal: tuple[Pedal, int]) -> None:
         device.read()
 
 
-def test_a_pedal_without_permission_says_which_group_may_read_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_pedal_without_permission_names_the_group_that_may_read_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def refuse(*_: object) -> int:
         raise PermissionError
 
-    monkeypatch.setattr(os, "open", refuse)  # Root has every permission.
+    # If root runs the test, no file lacks permission. The refusal is therefore simulated.
+    monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(InputError, match=r"^no permission to read /dev/input/event7; sudo usermod -aG input"):
         Pedal("/dev/input/event7").open()

@@ -1,4 +1,4 @@
-"""The thread of a device: it bears some failed reads, and can be started again after it was closed."""
+"""The thread of a device goes on after a few failed reads, and can be started again after it was closed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.devices.mice import until
 
 
 class Flaky:
-    """A device of which only every fifth read succeeds. It counts its reads."""
+    """A device whose reads fail, except for every fifth one. It counts its reads."""
 
     def __init__(self) -> None:
         self.reads = 0
@@ -26,7 +26,7 @@ class Flaky:
         raise OSError("not open")
 
 
-def test_four_failed_reads_in_a_row_are_no_loss_and_a_closed_reader_starts_again() -> None:
+def test_a_device_is_not_lost_after_four_failed_reads_in_a_row_and_a_closed_reader_can_start_again() -> None:
     device, lines = Flaky(), list[str]()
     reader = DeviceReader("left", device, lines.append)
     connected: list[bool] = []

@@ -67,7 +67,7 @@ def test_a_report_gives_both_buttons() -> None:
 
 @pytest.fixture
 def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
-    """Return a function that puts mice in place of hidapi's devices. A lost one is looked for without a pause."""
+    """Return a function that replaces hidapi's devices by mice. A lost mouse is searched for every millisecond."""
     monkeypatch.setattr(reading, "_RETRY", 0.001)
 
     def plug(*given: Mouse) -> None:
@@ -78,7 +78,7 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
 
 
 class Run:
-    """A run in simulated time with a SpaceMouse for each hand that is given."""
+    """A run in simulated time with a SpaceMouse for each hand that has one in ``config``."""
 
     def __init__(self, config: Config) -> None:
         self.lines: list[str] = []
@@ -90,7 +90,7 @@ class Run:
         self.now = self.pipeline.tick().now
 
     def wait(self, duration: float, send: Callable[[], None] = lambda: None) -> None:
-        """Let time pass, and let the mice ``send`` before each step."""
+        """Let ``duration`` [s] pass in steps of :data:`TICK`. Call ``send``, which sends reports, before each step."""
         for _ in range(round(duration / TICK)):
             send()
             self.now += TICK
@@ -109,17 +109,17 @@ class Run:
 
 
 def tap(run: Run, mouse: Mouse) -> None:
-    """Press and release the left button."""
+    """Press and release the left button of the mouse."""
     for held in (True, False):
         mouse.send(buttons(left=held))
         run.wait(0.15)
 
 
-def test_a_button_engages_and_the_cap_moves_the_tool_until_it_is_let_go(
+def test_a_button_engages_the_arm_and_the_cap_moves_the_tool_until_the_cap_is_released(
     cell: Cell, plugged: Callable[..., None]
 ) -> None:
     mouse = Mouse("/dev/hidraw3")
-    plugged(mouse, Mouse("/dev/hidraw0", usage=(1, 2)))  # The other device is an ordinary mouse.
+    plugged(mouse, Mouse("/dev/hidraw0", usage=(1, 2)))  # The second device is an ordinary mouse.
     run = Run(cell("spacemouse", right={"speed": 0.1}))
     assert run.lines == ["input_settings.spacemouse.right: SpaceMouse Compact at /dev/hidraw3 is connected"]
     forwards = partial(mouse.send, translation(back=-FULL))
@@ -217,7 +217,7 @@ def test_each_hand_has_its_own_mouse(cell: Cell, plugged: Callable[..., None]) -
         ),
     ],
 )
-def test_a_hand_without_its_mouse_ends_the_start_with_one_line_and_closes_the_others(
+def test_if_the_mouse_of_a_hand_is_missing_the_start_fails_with_one_line_and_all_other_mice_are_closed(
     cell: Cell, plugged: Callable[..., None], paths: tuple[str, ...], settings: dict[str, Any], told: str
 ) -> None:
     plugged(*(Mouse(path, serial="S") for path in paths))
@@ -228,12 +228,13 @@ def test_a_hand_without_its_mouse_ends_the_start_with_one_line_and_closes_the_ot
     assert not given.connected
 
 
-def test_a_device_without_permission_ends_the_start_with_the_rule_of_udev(
+def test_if_a_device_lacks_permission_the_start_fails_and_the_error_contains_the_udev_rule_that_helps(
     cell: Cell, plugged: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (node := tmp_path / "hidraw3").touch()
     plugged(Mouse(str(node)))
-    monkeypatch.setattr(os, "access", lambda path, mode: path != str(node))  # Root has every permission.
+    # If root runs the test, no file lacks permission. The refusal is therefore simulated.
+    monkeypatch.setattr(os, "access", lambda path, mode: path != str(node))
     given = make_input("spacemouse", cell("spacemouse", right={}))
     rule = r'as root, write KERNEL=="hidraw\*", ATTRS{idVendor}=="256f", TAG'
     with pytest.raises(InputError, match=rf"no permission to read .*hidraw3; {rule}"):
@@ -249,21 +250,23 @@ def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) ->
         make_input("spacemouse", cell("spacemouse", right={"speed": 2}))
 
 
-def test_the_command_run_finds_the_input_by_its_name_and_ends_with_the_same_line(
+def test_the_command_run_finds_the_input_by_its_name_and_prints_one_line_about_a_missing_mouse(
     cell: Cell, plugged: Callable[..., None], tmp_path: Path
 ) -> None:
     plugged()
     data = read_yaml(find_resource(CELL).read_text(encoding="utf-8"))
     file = tmp_path / "cell.yaml"
     file.write_text(yaml_of(data | {"input_settings": {"spacemouse": {"left": {}}}}))
-    cell("spacemouse")  # This makes the entry point known.
+    cell("spacemouse")  # This call installs the entry point, so that the command finds it.
     done = q2r2("run", str(file), "--input", "spacemouse", "--plant", "kinematic")
     assert done.exit_code == 2
     told = "input_settings.spacemouse.left: device = null: no SpaceMouse is there; connected now: none"
     assert done.stderr.count(told) == 1
 
 
-def test_without_hidapi_one_line_names_it(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_hidapi_is_not_installed_one_line_says_how_to_install_it(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "hidraw" if sys.platform == "linux" else "hid", None)
     with pytest.raises(
         InputError, match=r"^input_settings.spacemouse.right: hidapi is not installed; allowed: pip install 'hidapi"
@@ -271,7 +274,7 @@ def test_without_hidapi_one_line_names_it(cell: Cell, monkeypatch: pytest.Monkey
         make_input("spacemouse", cell("spacemouse", right={})).start()
 
 
-def test_hidapi_itself_reads_reports_from_a_terminal_in_place_of_the_device(tmp_path: Path) -> None:
+def test_the_real_hidapi_reads_reports_from_a_terminal_that_replaces_the_device(tmp_path: Path) -> None:
     """The real library opens, reads and loses a pseudo-terminal, to which a small library gives a HID descriptor."""
     pytest.importorskip("hidraw", reason="pip install hidapi")
     if (compiler := shutil.which("cc")) is None:

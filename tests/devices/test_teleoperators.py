@@ -1,4 +1,4 @@
-"""The hands of teleoperators and of rate devices, without lerobot. tests/lerobot/test_devices.py has the rest."""
+"""Hands of teleoperators and of rate devices, tested without lerobot. tests/lerobot/test_devices.py uses lerobot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ Cell = Callable[..., Config]
 GAMEPAD = {"teleoperator": {"type": "gamepad"}}
 
 
-def test_without_lerobot_one_line_names_the_remedy(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_lerobot_is_not_installed_one_line_says_how_to_install_it(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "lerobot", None)
     with pytest.raises(
         InputError, match=r"^input_settings.lerobot.right: lerobot is not installed; allowed: make lerobot$"
@@ -33,7 +35,7 @@ def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) ->
         make_input("lerobot", cell("lerobot", right={}))
 
 
-def test_the_switch_is_a_dead_mans_switch_whatever_the_cell_binds(cell: Cell) -> None:
+def test_the_control_grip_is_a_dead_mans_switch_whatever_the_bindings_of_the_cell_say(cell: Cell) -> None:
     bindings = adapted("lerobot", cell("lerobot", right=GAMEPAD)).teleop.bindings
     assert {binding.control: binding.action for binding in bindings.bound()} == {
         "trigger": "gripper_analog",
@@ -52,7 +54,7 @@ def test_a_rate_hand_integrates_its_velocity_in_axes_that_do_not_turn_with_it() 
     np.testing.assert_allclose(samples[-1].quaternion, (0.0, 0.0, np.sin(0.5), np.cos(0.5)), atol=1e-12)
 
 
-def test_a_deflected_hand_without_readings_stops_and_has_no_samples_and_a_hand_at_rest_has() -> None:
+def test_without_readings_a_moving_hand_stops_and_has_no_samples_but_a_resting_hand_still_has_samples() -> None:
     hand = RateHand("left")
     hand.poll([RateReading(FAST, HandInputs())], 0.0)
     hand.poll([], SILENCE / 2.0)
@@ -71,7 +73,7 @@ def test_a_tap_that_is_shorter_than_the_period_of_the_samples_is_not_lost() -> N
     assert [sample.inputs.button_lower for sample in hand.poll([pressed, released], 0.001)] == [True, False]
 
 
-def test_a_gap_between_two_polls_moves_the_hand_by_a_tenth_of_a_second_at_most() -> None:
+def test_after_a_gap_between_two_polls_the_hand_moves_for_at_most_a_tenth_of_a_second() -> None:
     hand = RateHand("left")
     hand.poll([RateReading(FAST, HandInputs())], 0.0)
     (sample,) = hand.poll([RateReading(FAST, HandInputs())], 0.14)

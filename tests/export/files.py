@@ -55,11 +55,19 @@ def write_recording(
 ) -> Path:
     """Write a recording with ticks at ``times`` [ns] since its start, and return its path.
 
-    In tick k, every measured joint is at -k [rad], every joint of the reference is at k [rad], and the x coordinate
-    of each tool at the reference is k [m]. ``numbers`` has the ticks' numbers if some ticks were lost. In the ticks
-    ``engaged``, the left arm is engaged, and the x coordinate of its target is 1000 + k [m]. In the ticks ``moving``,
-    the reference moves. ``openings`` has the values (arms,) of a field by the field's name. ``pictures`` has, by
-    camera, the times [ns] at which pictures were taken; each picture is brighter than the last.
+    In tick k, every measured joint is at -k [rad], and every joint of the reference is at k [rad]. At the reference,
+    the x coordinate of each tool is k [m].
+
+    Args:
+        path: The file of the recording.
+        times: The times of the ticks since the start [ns].
+        numbers: The numbers of the ticks. They are needed only if some ticks were lost.
+        engaged: The ticks in which the left arm is engaged. In tick k, the x coordinate of its target is 1000 + k [m].
+        moving: The ticks in which the reference moves.
+        openings: For each name of a field with openings, its values (arms,).
+        cameras: The cameras of the cell, by name.
+        pictures: For each camera, the times at which its pictures were taken [ns]. Each picture is brighter than the
+            picture before.
     """
     config = cell().model_copy(update={"cameras": dict(cameras or {})})
     how, cameras_of, notes = ("position", ("position",), EPOCH, False), tuple(config.cameras), {"task": "to count"}

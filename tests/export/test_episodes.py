@@ -164,7 +164,7 @@ def by_name(file: Path, pictures: bool) -> dict[int, str]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_bad_recordings_and_discarded_recordings_are_named_and_the_others_are_kept(
+def test_bad_recordings_and_discarded_recordings_are_named_and_all_other_recordings_are_kept(
     workers: int, run: Run, tmp_path: Path
 ) -> None:
     damaged, copy = tmp_path / "damaged.mcap", Path(shutil.copy(run.file, tmp_path / "copy.mcap"))

@@ -1,6 +1,7 @@
 """Frames are evenly spaced in time. Each frame has the newest observation, and the first command that followed.
 
-The features have the numbers that their names say, and a frame has the newest picture at or before it.
+Each number in the features is the number that its name describes. A frame has the newest picture that was captured at
+the time of the frame or before it.
 """
 
 from __future__ import annotations
@@ -210,7 +211,7 @@ def test_grippers_that_are_never_measured_are_left_out() -> None:
         features(given, robot())
 
 
-def test_a_number_that_is_not_finite_is_named_and_another_robot_is_refused() -> None:
+def test_a_number_that_is_not_finite_is_named_and_a_robot_that_is_not_the_recorded_robot_is_refused() -> None:
     given = frames()
     given["effort"][7, 2] = np.nan
     with pytest.raises(RecordingError, match=rf"observation.effort\[{robot().joint_names[2]}\] .* at frame 7"):
@@ -241,14 +242,14 @@ def test_a_frame_has_the_newest_picture_at_or_before_it(tmp_path: Path) -> None:
         pytest.param([], [4], r"no picture yet at 0\.004 s", id="never taken"),
     ],
 )
-def test_a_frame_without_a_picture_from_its_time_is_refused(
+def test_a_frame_is_refused_if_its_newest_picture_is_too_old_or_no_picture_was_taken_before_it(
     tmp_path: Path, taken: list[int], frames: list[int], what: str
 ) -> None:
     with pytest.raises(RecordingError, match=rf"a\.mcap: camera front has {what}; allowed: at most two of its periods"):
         shown(tmp_path, taken, frames)
 
 
-def test_a_picture_of_another_size_counts_as_damaged(tmp_path: Path) -> None:
+def test_a_picture_whose_size_is_not_the_size_of_its_camera_counts_as_damaged(tmp_path: Path) -> None:
     of = recording(tmp_path, [1], cameras={"front": CAMERA}, pictures={"front": [MS]})
     larger = CAMERA.model_copy(update={"width": 32})
     with pytest.raises(RecordingError, match=r"a\.mcap: damaged: a picture of camera front has a size"):

@@ -1,10 +1,10 @@
-"""Serve one simulated FR3 by franka-sim, which runs in an environment of its own: it needs older packages than ours.
+"""Serve one simulated FR3 by franka-sim. It runs in an environment of its own, because it needs older packages.
 
     python simulated_arm.py 127.0.0.11 build/fr3.xml 0 0 0 -1.57 0 1.57 0.785
 
-The numbers are the posture in which it starts [rad]. A line on standard input changes what the robot does: ``reflex``,
-``user stop`` or ``user stop ends``. The process ends at the end of standard input. Its standard output says what the
-robot does.
+The numbers are the posture in which the robot starts [rad]. A line on standard input changes what the robot does:
+``reflex``, ``user stop`` or ``user stop ends``. The process ends at the end of standard input. Its standard output says
+what the robot does.
 """
 
 from __future__ import annotations

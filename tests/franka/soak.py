@@ -46,11 +46,11 @@ class Report:
 
     sessions: int = 0
     ends: Counter[str] = field(default_factory=Counter)
-    failure: str = ""  # Why the sessions ended too early.
+    failure: str = ""  # The reason why the sessions ended too early; empty if they did not.
 
 
 class Operator(ScriptedInput):
-    """Hands that move in circles. Their operator presses again after a pause, and ends each session as ``ends`` say."""
+    """Hands that move in circles. Their operator presses again after a pause. ``ends`` lists how the sessions end."""
 
     def __init__(
         self, arms: Mapping[str, SimulatedArm], sessions: int, ends: tuple[str, ...], seed: int, trajectory: str

@@ -95,7 +95,7 @@ def test_positions_keep_the_jerk_limit_even_if_the_acceleration_jumps_by_twice_i
     for q in path:
         commands.append(sent.next([q], commands[-1] if commands else MIDDLE))
     assert checked(positions_in_time(commands)).violated == []
-    assert checked(positions_in_time(path)).violated == ["jerk"]  # The check finds it.
+    assert checked(positions_in_time(path)).violated == ["jerk"]  # The check finds that the path violates it.
 
 
 def positions_in_time(commands: list[Array]) -> list[Entry]:
@@ -104,7 +104,7 @@ def positions_in_time(commands: list[Array]) -> list[Entry]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_robot_that_drops_late_commands_and_gets_others_not_at_all_never_sees_a_limit_violated(seed: int) -> None:
+def test_no_limit_is_violated_although_the_robot_drops_late_commands_and_some_commands_are_not_sent(seed: int) -> None:
     random, robot = np.random.default_rng(seed), Robot()
     path = list(restless_path(ACCELERATION, random))
     follow(robot, path, mishaps(random, len(path)))
@@ -149,7 +149,7 @@ def test_the_check_finds_a_command_that_follows_a_dropped_command_too_abruptly()
     assert result.lost == pytest.approx(20, abs=2)
 
 
-def test_torques_change_no_faster_than_the_robot_allows_even_if_it_drops_some() -> None:
+def test_torques_change_no_faster_than_the_robot_allows_even_if_the_robot_drops_some_torques() -> None:
     random = np.random.default_rng(3)
     sent, held, entries = TorqueStream(limits.TORQUE), np.zeros(JOINTS), list[Entry]()
     wanted = [300.0 * random.standard_normal(JOINTS) for _ in range(1000)]

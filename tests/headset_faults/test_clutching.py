@@ -25,7 +25,7 @@ again_and_again = pytest.mark.parametrize("times", [10, pytest.param(100, marks=
 
 
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
-    """Align by the left hand's chord. The frame moves ``samples`` samples after the buttons are pressed.
+    """Align with the chord of the left hand. The frame moves ``samples`` samples after the buttons are pressed.
 
     The frame moves by the fraction ``shift`` of ``ANEW``.
     """

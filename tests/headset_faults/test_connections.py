@@ -26,7 +26,7 @@ def go_elsewhere(op: Operator) -> Iterator[float]:
 
 
 def engage_anew(op: Operator) -> Iterator[float]:
-    yield 0.6  # During this time, nothing may move.
+    yield 0.6  # During this time no press engages an arm, so no arm may move.
     yield from op.press(*SIDES)
     yield from op.move((0.0, 0.0, 0.05), seconds=0.3)
 

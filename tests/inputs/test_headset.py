@@ -118,7 +118,7 @@ def test_vibrations_without_a_headset_or_a_subscription_are_dropped(server: Head
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
 
 
-def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_no_old_one(
+def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_no_old_vibration(
     server: HeadsetServer,
 ) -> None:
     with registered(server) as headset:
@@ -208,7 +208,7 @@ def test_no_data_of_a_lost_connection_are_in_the_samples_of_the_next_connection(
 
 
 def forged(headset: FakeHeadset) -> bytes:
-    """Return a pose of the other dialect."""
+    """Return a pose in the dialect that this headset does not use."""
     other = "ros1" if headset.dialect == "ros2" else "ros2"
     return headset.frame("q2r_left_hand_pose", pack_pose(other, (0, 0, 0), IDENTITY))
 
@@ -328,7 +328,8 @@ def test_statistics_show_peer_dialect_counts_rates_and_last_values(server: Heads
     pose = statistics.topics["q2r_left_hand_pose"]
     assert isinstance(pose.last, HandPose)
     assert (statistics.dialect, pose.count, pose.last.position[0]) == (Dialect.ROS1, 90, 89.0)
-    assert pose.rate == pytest.approx(60.0, abs=1.0)  # No pose came in the last 0.2 s of the second.
+    # The rate is measured over one second. In its first 0.8 s poses came at 75 Hz, and in its last 0.2 s none came.
+    assert pose.rate == pytest.approx(60.0, abs=1.0)
     assert pose.age == pytest.approx(0.2)
     assert statistics.unknown_topics == {"q2r_head_pose": 1}
     assert set(statistics.subscribed) == {HAPTIC, "q2r_right_hand_haptic_feedback"}

@@ -175,7 +175,7 @@ def test_a_verdict_is_written_beside_its_recording_with_all_figures_and_threshol
     assert episode["figures"]["arms"]["left"]["gripper_changes"] == 1
 
 
-def test_files_that_cannot_be_read_are_named_and_the_others_are_judged(clean: Path, tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_are_named_and_the_other_files_are_judged(clean: Path, tmp_path: Path) -> None:
     files = {"notes": b"no recording", "empty": b"", "magic": clean.read_bytes()[:8]}
     for name, data in files.items():
         (tmp_path / f"{name}.mcap").write_bytes(data)
@@ -220,8 +220,10 @@ def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:
     return replace(FIGURES, **changes)
 
 
-# The columns are: the name and the value of the threshold, the group and the name of the figure that it limits, a value
-# of the figure at the limit, a value beyond the limit, and the end of the text of the reason.
+# Columns 1 and 2: the name and the value of a threshold.
+# Columns 3 and 4: the group and the name of the figure that the threshold limits.
+# Columns 5 and 6: a value of the figure at the limit, and a value beyond the limit.
+# Column 7: the end of the text of the reason.
 CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
     ("min_pose_rate", 30.0, "hand", "pose_rate_hz", 30.0, 29.0, "right hand: poses at 29.0 Hz (at least 30)"),
     ("max_dropout_share", 0.1, "hand", "dropout_share", 0.1, 0.2, "dropouts 20.0 % of the time (at most 10)"),
@@ -307,7 +309,8 @@ def test_an_episode_with_one_figure_beyond_its_threshold_is_discarded_for_this_f
 
 def test_this_file_tests_every_threshold_of_episodes() -> None:
     tried = {case[0] for case in CASES}
-    of_subtasks = {"min_subtask_time", "max_subtask_time", "needs_subtasks"}  # See tests/recording/test_subtasks.py.
+    # These thresholds are tested in tests/recording/test_subtasks.py.
+    of_subtasks = {"min_subtask_time", "max_subtask_time", "needs_subtasks"}
     others = {"dropout", "keep_failed", "needs_end", "needs_task"}
     assert set(JudgeSettings.model_fields) - tried == others | of_subtasks
 

@@ -1,7 +1,8 @@
-"""The six servos of an SO-101 leader behind a pseudo-terminal, by Feetech's protocol. lerobot drives them as real ones.
+"""Six simulated servos of an SO-101 leader behind a pseudo-terminal. lerobot uses them like real servos.
 
-The instructions and the addresses of the memory are those of lerobot's ``motors/feetech/tables.py`` and of Feetech's
-SDK. A packet is FF FF, id, length, instruction or error, parameters, and the inverted sum of all bytes after FF FF.
+They use Feetech's protocol. The instructions and the addresses of the memory are taken from lerobot's
+``motors/feetech/tables.py`` and from Feetech's SDK. A packet contains FF FF, id, length, instruction or error,
+parameters, and the inverted sum of all bytes after FF FF.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The gamepad of lerobot without pygame: a test sets sticks and buttons. lerobot finds it by its config's name."""
+"""lerobot's gamepad without pygame. A test sets its sticks and buttons. lerobot finds it by the name of its config."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lerobot.teleoperators.gamepad.gamepad_utils import InputController
 
 
 class StillController(InputController):
-    """What lerobot reads instead of a joystick."""
+    """A replacement for the joystick that lerobot reads."""
 
     deltas = (0.0, 0.0, 0.0)
 
@@ -24,7 +24,7 @@ class SticksConfig(GamepadTeleopConfig): ...
 
 
 class Sticks(GamepadTeleop):
-    """The gamepad."""
+    """lerobot's gamepad, which reads :attr:`sticks` instead of a joystick."""
 
     config_class = SticksConfig
     name = "sticks"

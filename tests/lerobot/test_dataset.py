@@ -104,7 +104,7 @@ def test_the_loader_tells_the_subtask_of_every_frame(tmp_path: Path) -> None:
     loaded = LeRobotDataset("q2r2/test", root=made)
     expected = [0] * 15 + [1] * 35 + [2] * 15 + [3] * 60
     assert [int(loaded[index]["subtask_index"]) for index in range(125)] == expected
-    if find_spec("lerobot.datasets.language_render") is None:  # Up to lerobot 0.5, the loader itself adds the names.
+    if find_spec("lerobot.datasets.language_render") is None:  # Up to lerobot 0.5, the loader adds the names.
         assert [loaded[index]["subtask"] for index in (0, 15, 40, 50)] == [names["subtask"][at] for at in (0, 1, 1, 2)]
         return
     from lerobot.datasets.language_render import active_at

@@ -37,7 +37,7 @@ LINE = "input_settings.lerobot.right: "
 
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServoBus]:
-    """Return a bus. Feetech's driver waits for an answer until the bus has dropped the request, and not for 50 ms.
+    """Return a bus. Feetech's driver waits until the bus has answered or dropped the request, instead of for 50 ms.
 
     Otherwise these tests would fail on a busy computer, whose threads answer late.
     """
@@ -80,7 +80,7 @@ def cell(given: dict[str, Any]) -> Config:
 
 
 def polled(source: Any, fits: Callable[[HandSample], bool]) -> HandSample:
-    """Poll until a sample fits, however long the threads take."""
+    """Poll until ``fits`` is True for a sample, and return it. There is no timeout, because the threads may be slow."""
     while True:
         for sample in source.poll(time.monotonic()):
             if fits(sample):
@@ -145,7 +145,7 @@ def test_a_leader_that_is_not_ready_ends_the_start_with_one_line(tmp_path: Path,
     assert "\n" not in str(raised.value)
 
 
-def test_an_unknown_teleoperator_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_teleoperator_is_refused_with_the_names_of_the_known_teleoperators(tmp_path: Path) -> None:
     source = make_input("lerobot", cell({"right": {"teleoperator": {"type": "so102_leader"}}}))
     with pytest.raises(
         InputError, match=rf"^{LINE}teleoperator.type = so102_leader: allowed: .*gamepad, .*so101_leader"
@@ -153,7 +153,9 @@ def test_an_unknown_teleoperator_is_refused_with_the_known_ones(tmp_path: Path) 
         source.start()
 
 
-def test_a_gamepad_moves_its_hand_at_a_speed_and_engages_by_its_own_button(tmp_path: Path) -> None:
+def test_the_sticks_of_a_gamepad_give_the_velocity_of_its_hand_and_its_own_button_engages_the_arm(
+    tmp_path: Path,
+) -> None:
     sticks = Sticks.sticks
     source = make_input("lerobot", cell({"right": {"teleoperator": {"type": "sticks"}, "speed": 0.5}}))
     source.start()

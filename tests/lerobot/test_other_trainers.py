@@ -19,7 +19,7 @@ try:
     from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
     OF_ALL = False  # True if the converter needs the folder that contains all datasets.
-except ImportError:  # This is the import of lerobot 0.4.
+except ImportError:  # In lerobot 0.4, the converter is in another module.
     from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
 
     OF_ALL = True

@@ -37,8 +37,8 @@ from tests.recording.runs import ROOT
 from tests.ros.processes import EXECUTABLES, as_arguments, environment_of
 
 register_third_party_plugins()
-# Required motion of a joint [rad]; tolerance of a joint [rad] and of an opening, which is 0 to 1; and number of tries,
-# each of which takes at least 1/30 s.
+# MOVED: required motion of a joint [rad]. NEAR: tolerance of a joint [rad] and of an opening, which is 0 to 1.
+# TRIES: number of tries. Each try takes at least 1/30 s.
 MOVED, NEAR, TRIES = 0.02, 0.004, 1800
 ROS_RATE = 200.0  # [Hz]
 

@@ -27,7 +27,7 @@ def robot(config: Config) -> Robot:
 
 
 @pytest.mark.slow
-def test_one_joint_moves_by_a_degree_and_back_while_all_others_rest(config: Config) -> None:
+def test_one_joint_moves_by_a_degree_and_back_while_all_other_joints_rest(config: Config) -> None:
     with slow_run(config) as run:
         start = run.reference
         motion = measure_joint(run, 8)

@@ -131,7 +131,7 @@ def test_lateness_and_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> N
     for _ in range(6):
         loop.wait()
     late = loop.lateness.percentiles(1e-3)
-    # The third tick is 25 ms late. The due times start anew there, so the fourth tick is not late.
+    # The third tick is 25 ms late. The later due times are counted from this tick, so the fourth tick is not late.
     assert loop.overruns == 1
     assert (late.p50, late.max) == (pytest.approx(0.0, abs=2e-3), pytest.approx(25.0))
     assert late.p99 == pytest.approx(25.0)

@@ -89,7 +89,7 @@ def test_each_picture_that_a_policy_sees_has_the_time_of_its_own_capture(tmp_pat
     policy = Seeing()
     run = Run(front(write_video(tmp_path / "front.avi", range(COUNT))), policy, lambda _: len(policy.seen) >= ENOUGH)
     captured = {round(time, 6): number for time, number in run.shots}
-    first, *others = policy.seen  # The first picture may be older than ``run.shots``.
+    first, *others = policy.seen  # The first picture may be older than all pictures in ``run.shots``.
     assert [captured[round(time, 6)] for time, _ in others] == [number for _, number in others]
     start = first[0] - first[1] / FPS
     passed = [round((time - start) * FPS) % COUNT for time, _ in policy.seen]

@@ -61,7 +61,7 @@ def changed(file: Path, data: Any) -> Path:
 
 
 def elbow_at_the_end(config: Config) -> float:
-    """Return the angle of the left arm's third joint [rad], after both arms have followed."""
+    """Return the angle of the left arm's third joint [rad], after both arms have followed their hands."""
     loop = Pipeline.from_config(config.model_copy(update={"loop_rate_hz": 500.0}))
     angles: list[float] = []
     loop.listeners.append(lambda tick: angles.append(tick.reference.q[2]))

@@ -107,7 +107,7 @@ def test_a_recording_says_at_every_frame_who_acted_and_its_replay_is_equal_to_th
 
 
 class Jumping(Circle):
-    """A policy whose actions after 0.3 s put the left tool 1 m away."""
+    """A policy whose actions jump: from 0.3 s on, they put the left tool 1 m away from its path."""
 
     def __call__(self, observation: Observation) -> Array:
         actions = super().__call__(observation)

@@ -32,7 +32,7 @@ def test_a_shipped_cell_follows_hands_in_a_circle_and_keeps_the_contract_for_tar
     config = load_config(file).model_copy(update={"loop_rate_hz": 500.0})
     pipeline = Pipeline.from_config(config, input=ScriptedInput.from_config(config, "circle"), plant="mujoco")
     assert preflight_faults(pipeline.robot, pipeline.controller.settings, pipeline.controller) == ()
-    watch = Watch(pipeline)  # It checks the contract at every tick.
+    watch = Watch(pipeline)  # This listener checks the contract at every tick.
     summary = pipeline.run(2.8, realtime=False)
     heights = [[tool.translation[2] for tool in tick.tools.values()] for tick in watch.ticks]
     assert (np.ptp(heights, axis=0) > 0.02).all()

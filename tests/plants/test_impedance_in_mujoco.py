@@ -137,7 +137,9 @@ def test_each_mode_of_the_tool_on_its_spring_returns_with_the_damping_ratio_of_t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["home", "reaching far", "elbow out"])
-def test_arms_with_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant, robot: Robot, name: str) -> None:
+def test_arms_whose_masses_differ_from_the_controllers_model_stay_stable_and_within_2_cm(
+    reweighed: MujocoPlant, robot: Robot, name: str
+) -> None:
     loop = TorqueLoop(reweighed, robot, SETTINGS, posture(robot, name), SLOW)
     largest = 0.0
     for _ in loop.ticks(2.5):
@@ -208,9 +210,7 @@ def test_after_a_blow_an_arm_keeps_the_bounds_of_its_torques_and_comes_back(bare
 
 
 def test_a_held_mass_that_the_controller_knows_causes_no_sag_and_no_jump_of_torques(bare_config: Config) -> None:
-    """A mass of 2 kg at the tool's point causes a sag of 9.8 mm at 2000 N/m, as long as the controller does not know
-    the mass.
-    """
+    """A mass of 2 kg at the tool frame causes a sag of 9.8 mm at 2000 N/m if the controller does not know the mass."""
     data = bare_config.model_dump()
     data["arms"]["left"]["gripper"]["object"] = {"mass": 2.0}
     config = Config.model_validate(data)

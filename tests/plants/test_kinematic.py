@@ -31,7 +31,7 @@ def test_the_plant_stands_at_home_with_open_grippers_until_the_first_command(
 def test_the_plant_is_exactly_at_the_command_at_the_end_of_the_tick(plant: KinematicPlant, robot: Robot) -> None:
     command = replace(hold(robot.home + 0.1), v=np.full(14, 0.3))
     plant.apply(command)
-    command.q[:], command.v[:] = 99, 99  # The caller may change its arrays afterwards.
+    command.q[:], command.v[:] = 99, 99  # These changes of the given arrays must have no effect.
     np.testing.assert_array_equal(plant.state().q, robot.home)
     for v in (0.3, 0.0):
         plant.advance(0.001)

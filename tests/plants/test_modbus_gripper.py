@@ -47,7 +47,8 @@ def connect(simulated: SimulatedGripper, monkeypatch: pytest.MonkeyPatch) -> Ite
         return started[-1]
 
     yield start
-    simulated.stop()  # Otherwise, a gripper that waits for an answer would go on waiting.
+    # The timeout for an answer is 30 s here. A lost connection ends the wait for an answer at once.
+    simulated.stop()
     for gripper in started:
         gripper.close()
 

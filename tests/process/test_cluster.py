@@ -105,11 +105,12 @@ def test_a_relative_path_means_the_same_file_for_a_worker_as_for_the_sender(
     place = Cluster(cluster.address)
     results = place.results(name_in_folder, [Path("note")], lambda file: file, tmp_path)
     assert list(results) == ["note: found"]
-    assert [file.name for file in tmp_path.iterdir()] == ["note"]  # No file that probes the folder is left.
+    # The files that tested whether the workers see the folder have been deleted.
+    assert [file.name for file in tmp_path.iterdir()] == ["note"]
 
 
 @pytest.mark.slow
-def test_a_worker_with_another_version_of_this_package_or_of_python_raises_an_error_of_one_line(
+def test_a_worker_whose_version_of_this_package_or_of_python_differs_from_ours_causes_an_error_of_one_line(
     cluster: DaskCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as changed:

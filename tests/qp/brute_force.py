@@ -74,6 +74,6 @@ def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.N
         return v
     try:
         v[free] = np.linalg.solve(system, right)[: free.sum()]
-    except np.linalg.LinAlgError:  # There are more hard rows than free joints.
+    except np.linalg.LinAlgError:  # For example, there are more hard rows than free joints.
         return None
     return v

@@ -132,7 +132,8 @@ class Noting:
 
     def solve(self, problem: QpProblem) -> QpSolution:
         if problem.minimum is None:
-            self.problems.append(problem)  # The problem is already a copy, because this solver is not ours.
+            # The controller gives a copy of the problem to a solver of another package, so no further copy is made.
+            self.problems.append(problem)
         return self._solver.solve(problem)
 
 

@@ -92,7 +92,8 @@ def test_a_picture_shows_a_moved_object_at_its_new_position(tmp_path: Path) -> N
     assert isinstance(plant, MujocoPlant)
 
     def moves_a_block(tick: Tick) -> None:
-        if tick.t >= 0.5 * DURATION:  # By then, MuJoCo has put the block to sleep.
+        # Half of the run is so long that MuJoCo no longer simulates the resting block (it sleeps).
+        if tick.t >= 0.5 * DURATION:
             plant.data.joint("blue_block_free").qpos[:3] = (0.4, 0.0, 0.7)
 
     loop.listeners.append(moves_a_block)

@@ -210,7 +210,7 @@ def test_every_number_of_a_tick_has_its_own_label_and_its_own_index() -> None:
         assert number == labels.index(label)
 
 
-def test_arrays_and_texts_are_read_as_written_and_an_array_of_another_length_is_refused() -> None:
+def test_arrays_and_texts_are_read_as_written_and_an_array_of_a_wrong_length_is_refused() -> None:
     numbers = np.array([[0.5, np.nan, -0.0], [1.0, np.inf, 2.0]])
     payloads = [messages.array(row) for row in numbers]
     assert messages.numbers_of(payloads, 3).tobytes() == numbers.tobytes()

@@ -64,7 +64,8 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
 def test_requests_that_a_program_made_are_repeated_in_the_replay(tmp_path: Path) -> None:
     loop = pipeline("circle", "kinematic", control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     tool = loop.robot.tool_pose(loop.robot.home, "left").translation
-    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # The obstacle is so near there that the arms slow down.
+    # At this position, the obstacle is so near to the arms that they slow down.
+    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())
     changes = {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
     other = TeleopSettings.model_validate(loop.config.teleop.model_dump() | changes)
     asks = {
@@ -100,7 +101,7 @@ def test_a_replay_of_a_run_in_real_time_is_identical(tmp_path: Path) -> None:
     loop = pipeline("circle", "mujoco", "torque", human=True)
     file = file_of(record(tmp_path, loop, 1.2, realtime=True))
     result = replay(file)
-    # The arms may never be engaged if this computer is slow, because a loop that stalls pauses them.
+    # On a slow computer, it is possible that no arm is ever engaged, because a loop that stalls pauses the arms.
     assert (result.difference, result.ended_by) == (None, None)
     assert result.ticks > 10
     recording = Recording(file)

@@ -1,6 +1,7 @@
 """The time over which commands are averaged follows from the jerk limit.
 
-The averaged command can be off the path of the reference, so every pair keeps a distance that is greater by as much.
+The averaged command can deviate from the path of the reference. Every pair therefore keeps a distance that is greater
+by an allowance. No such deviation brings the pair closer by more than its allowance.
 """
 
 from __future__ import annotations

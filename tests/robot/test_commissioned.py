@@ -101,7 +101,7 @@ def test_a_real_cell_that_was_not_commissioned_is_refused_with_the_command_that_
     why = f"{file}: there is no my_cell.commissioned.json; q2r2 commission {file} commissions it"
     with pytest.raises(ConfigError, match=f"^{re.escape(why)}$"):
         load_commissioned(file)
-    assert load_commissioned(file, "mujoco") == load_config(file)  # Nothing real moves.
+    assert load_commissioned(file, "mujoco") == load_config(file)  # In a simulation, no real arm moves.
 
 
 def test_a_commissioned_cell_moves_at_a_tenth_of_its_speed_unless_full_speed_is_requested(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def test_a_pair_keeps_the_distance_of_its_class(dual_iiwa: Robot, a: str, b: str
     assert 0.02 in alone.values()
 
 
-def test_a_hand_in_its_arms_model_is_a_tool_and_the_links_that_its_gripper_moves_are_fingers() -> None:
+def test_a_hand_in_the_model_of_its_arm_is_a_tool_and_the_links_that_its_gripper_moves_are_fingers() -> None:
     gripper = {"joints": ["panda_finger_joint1"], "open_position": 0.04, "closed_position": 0.0}
     home = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
     config = one_arm(model="example-robot-data:panda", home=home, gripper=gripper)

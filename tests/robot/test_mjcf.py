@@ -123,7 +123,7 @@ def test_the_limits_of_joints_come_from_the_file_but_their_velocity_limits_come_
     assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
 
 
-def test_a_capsule_stays_a_capsule_and_a_visual_geom_becomes_a_collision_shape_only_if_a_body_has_no_other(
+def test_a_capsule_stays_a_capsule_and_a_visual_geom_becomes_a_collision_shape_only_if_its_body_has_none(
     arm: Path,
 ) -> None:
     urdf, _, geometry = read(arm)

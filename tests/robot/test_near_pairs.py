@@ -72,7 +72,7 @@ def test_the_warning_contains_python_code_that_prevents_the_warning(
         ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
     ],
 )
-def test_the_warning_names_two_changes_if_pairs_are_too_near_at_home_and_others_are_near_in_all_postures(
+def test_the_warning_names_two_changes_if_some_pairs_are_too_near_at_home_and_other_pairs_in_all_postures(
     model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file = load_description(f"example-robot-data:{model}").file

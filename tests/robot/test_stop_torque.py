@@ -12,7 +12,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
 from tests.robot.conftest import one_arm
 
-FAST = np.full(7, 10.0)  # No iiwa 7 has enough torque for this [rad/s^2].
+FAST = np.full(7, 10.0)  # No iiwa 7 has enough torque for this acceleration [rad/s^2].
 UNEQUAL = np.array([8.0, 5.0, 6.0, 10.0, 11.0, 12.0, 13.0])
 
 

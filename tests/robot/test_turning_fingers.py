@@ -221,4 +221,4 @@ def test_no_second_derivative_of_a_position_by_two_joints_exceeds_its_bound() ->
             found = float(np.linalg.norm(second, axis=1).max()) / (4.0 * h**2)
             assert found <= bounds[i, k] + 1e-6, (i, k)
             nearest[i, k] = max(nearest[i, k], found / max(bounds[i, k], 1e-9) if bounds[i, k] else 0.0)
-    assert nearest.min() > 0.5  # A smaller value would show that the bounds are useless.
+    assert nearest.min() > 0.5  # A smaller ratio would show that the bounds are useless.

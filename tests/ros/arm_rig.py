@@ -212,7 +212,7 @@ class ArmRigs:
         self.wait(condition, what)
 
     def press(self, button: str = "lower") -> None:
-        """Hold one button of each hand for several messages, and then release it for several. This is no chord."""
+        """Hold one button of each hand for several messages, and release it for several messages. This is no chord."""
         for held in (True, False):
             for rig in self.rigs:
                 setattr(rig, button, held)

@@ -188,7 +188,7 @@ def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
 # Speed of 3 % of a joint's limit [rad/s]. A slower arm still settles, but no longer follows.
 SLOW = 0.05
 REST = 0.01  # A joint that is slower than this rests [rad/s].
-REST_TIME = 0.3  # Time for which joints have to be slower than that [s].
+REST_TIME = 0.3  # Time for which joints have to be slower than ``REST`` [s].
 # The window is shorter than the duration of a jump. It is longer than the time in which the process of a robot that got
 # no processor time catches up [s].
 SPEED_WINDOW = 0.2

@@ -136,7 +136,8 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     ended = Event()
 
     def spin() -> None:
-        # If a test destroys an entity that the executor is about to wait for, the executor spins on with the others.
+        # If a test destroys an entity that the executor is about to wait for, the executor goes on with the remaining
+        # entities.
         while not ended.is_set():
             with suppress(InvalidHandle):
                 executor.spin()

@@ -20,7 +20,7 @@ _NEAR = 1e-9  # Relative tolerance of limits.
 _UNEVEN = 0.004  # Relative tolerance of the time between two ticks, because the node's clock makes it uneven.
 _NOTICED = 0.15  # Time until the end of a session is noticed, by late states or by a silence of 0.1 s [s].
 _RESTARTED = 1.0  # Shortest time until a driver's process is restarted [s].
-_ALLOWANCE = 0.2  # Braking may last longer than the certified stop by this time [s].
+_ALLOWANCE = 0.2  # Braking is allowed to last longer than the certified stop by this time [s].
 _LONGEST_STOP = 1.0  # Longest time from the end of a session to rest [s].
 _CREEPS = 1e-3  # A slower joint counts as resting [rad/s].
 _STUCK = 20.0  # If nothing moves in a session for this time, the soak has failed [s].
@@ -42,9 +42,9 @@ class LbrSoak:
         self._how, self._ends_at, self._progress = "start", math.inf, self.virtual.now
         self._phase, self._seen = Phase.INACTIVE, dict.fromkeys(SIDES, 0)
         self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # The newest command: session, tick, q, v.
-        self._late = 0  # The last tick that was late.
+        self._late = 0  # The number of the last tick that was late.
         self._brakings = 0  # Number of brakings so far.
-        self._disturbed = 0.0  # Until this time, the end of a session may still be unnoticed [s].
+        self._disturbed = 0.0  # Until this time, the end of a session need not be noticed [s].
         self.virtual.on_command = self._on_command
         robot, node = self.virtual.robot, self.virtual.node
         self._fastest = robot.velocity_limit * node._controller.settings.velocity_scale * (1.0 + _NEAR)
@@ -182,7 +182,7 @@ class LbrSoak:
     def _check_rest(self, braking: int) -> None:
         """Check the arms after the braking time.
 
-        The controller may be active, brake again, or let a joint creep to its goal.
+        The controller is allowed to be active, to brake again, or to let a joint creep to its goal.
         """
         node = self.virtual.node
         fastest = float(np.abs(node._loop._velocity).max())

@@ -60,7 +60,7 @@ def _run(command: list[str], environment: dict[str, str], log: str) -> None:
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.argv = list(command)
-    sys.modules.pop(command[0], None)  # The module runs as __main__.
+    sys.modules.pop(command[0], None)  # The module runs anew, under the name __main__.
     runpy.run_module(command[0], run_name="__main__", alter_sys=True)
 
 
@@ -81,7 +81,8 @@ class RosProcess:
         """Return the first whole line of output that contains ``text``. Fails if the process ends or time runs out."""
         deadline = time.monotonic() + timeout
         while True:
-            ended = not self.running  # This comes before reading, so that no last output is missed.
+            # Whether the process has ended is found out before its output is read, so that no output is missed.
+            ended = not self.running
             for line in self.output.splitlines(keepends=True):
                 if text in line and line.endswith("\n"):
                     return line.rstrip("\n")

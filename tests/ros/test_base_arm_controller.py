@@ -278,7 +278,8 @@ def test_without_a_running_clock_an_arm_is_neither_engaged_nor_ready(
     assert (rig.state["engaged"], rig.targets) == (False, [])  # The earlier press has not engaged the arm.
     rig.engage()
     node.destroy_timer(timer)
-    # On a machine with other load, another fault may have paused the arm before. So its present reason is asked for.
+    # On a machine with other load, another fault may have paused the arm already. The test therefore reads the problem
+    # of the clock, and not the reason for the pause.
     rig.wait(lambda: rig.state.get("clock_problem") == {"kind": RosReason.CLOCK_STANDS}, "it says that time stops")
     rig.wait(lambda: not rig.state["engaged"] and not rig.state["ready"], "it is paused")
     rig.press()

@@ -82,7 +82,8 @@ def test_an_invalid_transform_is_ignored(bad: float, tree: FrameTree) -> None:
 
 def test_a_message_with_a_name_that_is_not_text_is_dropped_and_the_next_message_is_read(node: Any) -> None:
     dropped: list[str] = []
-    node.drop = lambda topic, text: dropped.append(topic)  # Nodes of the package have this method.
+    # A FrameListener calls this method, which the package's nodes have.
+    node.drop = lambda topic, text: dropped.append(topic)
     listener = FrameListener(node)
     publisher = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
     good = serialize_message(TFMessage(transforms=[stamped_transform("mount", "tool", C)]))
@@ -105,7 +106,7 @@ def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
 def test_two_publishers_of_a_frame_are_a_conflict_only_if_they_disagree(
     second: pin.SE3, disagree: bool, domain: int, node: Any
 ) -> None:
-    node.now = 0.0  # Nodes of the package have this attribute.
+    node.now = 0.0  # A FrameListener needs this attribute, which the package's nodes have.
     listener = FrameListener(node)
     disputed = Reason.of(RosReason.FRAME_DISPUTED, frame="mount", publishers="/another and /test")
     timers = [send_from(node, "mount", A, 300), send_from(node, "elsewhere", B, 0)]

@@ -105,7 +105,9 @@ def test_distances_and_gains_of_the_controller_are_set_together_or_not_at_all(co
     node.destroy_node()
 
 
-def test_permitted_impedance_settings_apply_to_both_arms_and_others_are_refused(context: Any, robot: Robot) -> None:
+def test_permitted_impedance_settings_apply_to_both_arms_and_settings_that_are_not_permitted_are_refused(
+    context: Any, robot: Robot
+) -> None:
     impedance = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
     zero = np.zeros(robot.model.nv)
     at_home = RobotState(robot.home, zero, zero, None, 0.0)

@@ -195,7 +195,7 @@ def shared_memory(process: Any) -> list[str]:
     return [line for line in mapped.read_text().splitlines() if "/dev/shm/fastrtps" in line]
 
 
-def test_a_node_that_is_confined_to_this_machine_hears_others_and_shares_no_memory(
+def test_a_node_that_is_confined_to_this_machine_hears_other_nodes_and_uses_no_shared_memory(
     node: Any, processes: Processes
 ) -> None:
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -55,9 +55,9 @@ class Stream:
         self.published = self.left_out = 0
 
     def run(self, seconds: float, fault: Callable[[], Reason | None] | None = None) -> Reason | None:
-        """Publish for ``seconds``, or until ``fault`` returns a reason. By default, the reason is a silent listener.
+        """Publish for ``seconds``, or until ``fault`` returns a reason. Return this reason; None if there was none.
 
-        Return this reason, or None.
+        By default, ``fault`` returns a reason if a listener is silent.
         """
         end, find = time.monotonic() + seconds, fault or self._publisher.silence
         while time.monotonic() < end:
@@ -216,7 +216,7 @@ def test_a_stream_reports_its_end_only_if_its_operator_paused_the_arm(
     arm.destroy_node()
 
 
-_LOST = "_NODE_NAME_UNKNOWN_"  # rcl uses this name.
+_LOST = "_NODE_NAME_UNKNOWN_"  # rcl gives this name to a node whose name it does not know.
 LISTENER = """
 import rclpy
 from geometry_msgs.msg import PoseStamped

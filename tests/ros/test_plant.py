@@ -114,7 +114,8 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture
 def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
     node: Any, robot: Robot, config: Config, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RosPlant, "standstill", None)  # These arms never move, so the check is off.
+    # The arms of this test never move, so the check for arms that stand still is off.
+    monkeypatch.setattr(RosPlant, "standstill", None)
     states = node.create_publisher(JointState, "joint_states", 10)
     still = joint_state_message(robot.joint_names, robot.home, 0.0 * robot.home, 0.0 * robot.home, 0.0)
     timer = node.create_timer(0.01, lambda: states.publish(still))
@@ -125,7 +126,7 @@ def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
         with driven(config, robot, goal) as (ticks, _):
             wait_until(lambda: ticks and np.abs(ticks[-1].reference.q - robot.home).max() > 0.04, "a command is away")
             heard = subscribed(node, JointTrajectory, "joint_trajectory", COMMAND_QOS)
-            # The middleware notices the receiver before the loop does. The commands between are still delivered.
+            # The middleware notices the receiver before the loop does. Commands that are sent meanwhile are delivered.
             commands = (heard.get(timeout=PATIENCE).points[0].positions for _ in range(UNDER_WAY))
             assert any(np.abs(np.array(command) - robot.home).max() < 0.03 for command in commands)
             assert "a new receiver takes the commands" in caplog.text
@@ -151,7 +152,7 @@ def test_if_another_node_commands_the_arms_they_are_released_and_the_other_node_
         wait_until(lambda: "/test commands the arms on /joint_trajectory" in caplog.text, "the other is named")
 
 
-def test_a_plant_whose_arms_are_missing_or_commanded_by_others_raises_an_error_of_one_line(
+def test_a_plant_whose_arms_are_missing_or_commanded_by_other_nodes_raises_an_error_of_one_line(
     node: Any, robot: Robot, config: Config, processes: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plant_module, "_WAIT", 0.5)

@@ -62,7 +62,7 @@ def pair(processes: Processes) -> RosProcess:
     return process
 
 
-def test_a_process_that_dies_is_reported_and_ends_the_others(pair: RosProcess) -> None:
+def test_if_one_process_dies_its_end_is_reported_and_all_other_processes_are_ended(pair: RosProcess) -> None:
     first, second = children(pair.pid)
     os.kill(first, signal.SIGKILL)
     assert f"first (process {first}) was ended by SIGKILL" in pair.wait_for("[up] ")

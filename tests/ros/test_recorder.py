@@ -63,14 +63,14 @@ class RunningRecorder:
 
     def poses(self) -> list[bytes]:
         """Return the hand's poses that the file contains so far."""
-        with suppress(RecordingError):  # A write may be going on.
+        with suppress(RecordingError):  # The recorder may be writing, so that the file is incomplete.
             recording = open_recording(self.folder)
             return [message.payload for messages in recording.messages((HAND,)) for message in messages]
         return []
 
     def discarded(self) -> list[bool]:
         """Return, for each episode that the file contains so far, whether it was discarded."""
-        with suppress(RecordingError):  # A write may be going on.
+        with suppress(RecordingError):  # The recorder may be writing, so that the file is incomplete.
             return [span.discarded for span in read_spans(open_recording(self.folder))]
         return []
 
@@ -98,7 +98,7 @@ def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
         message.header.stamp.sec = 1000 + number
         publisher.publish(message)
         time.sleep(0.002)
-    last = serialize_message(message)[:8]  # These bytes contain its seconds.
+    last = serialize_message(message)[:8]  # These bytes contain the seconds of the stamp.
     wait_until(lambda: recorder.poses()[-1].startswith(last), "the last pose is in the file")
     return last
 
@@ -110,7 +110,7 @@ def test_the_file_contains_messages_byte_for_byte_and_can_be_read_without_ros(
 
     # Bytes between a message's fields are arbitrary memory of the sender. Compare with the bytes of another listener.
     heard: list[bytes] = []
-    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The recorder has the same depth.
+    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The recorder uses the same depth.
     node.create_subscription(PoseStamped, HAND, heard.append, qos, raw=True)
     before = time.time_ns()
     strange = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
@@ -294,7 +294,7 @@ def test_a_whole_set_is_recorded_and_judged_and_ends_at_ctrl_c(node: Any, proces
     enough = states.wait_for()["messages"] + 10_000  # Each tick has about 10 messages.
     wait_until(lambda: states.wait_for()["messages"] > enough, "the arms are moved", patience=600.0)
     assert call(node, "/recorder/stop").success
-    # Nodes with real-time priority may use all processors. They are stopped, so that the judging process gets time.
+    # Nodes with real-time priority can use all processors. They are stopped, so that the judging process gets time.
     others = [pid for pid in children(process.pid) if "recorder" not in Path(f"/proc/{pid}/cmdline").read_text()]
     for pid in others:
         os.kill(pid, signal.SIGSTOP)

@@ -55,7 +55,8 @@ def test_a_set_listener_tells_the_rates_of_the_senders_and_subscribes_only_to_st
             return {topic.name: topic.rate for topic in listener.view().topics}
 
         wait_until(lambda: (rates().get("/target") or 0.0) > 10.0, "the topics have rates")
-        assert "/stranger" not in {one.name for one in listener.view().nodes}  # This node reports something else.
+        # What this node reports is not a valid state.
+        assert "/stranger" not in {one.name for one in listener.view().nodes}
         assert node.count_subscribers("/target") == 0
     node.destroy_timer(timer)
     node.destroy_publisher(sender)
@@ -76,7 +77,8 @@ print("left:", sum(isinstance(one, Executor) for one in gc.get_objects()))
 """
     state = node.create_publisher(String, "/test/state", 10)
     message = String(data=json.dumps({"level": "ok", "message": "here"}))
-    timer = node.create_timer(0.01, lambda: state.publish(message))  # The last spin then ends with a message.
+    # Messages come all the time, so that the last spin ends because of a message.
+    timer = node.create_timer(0.01, lambda: state.publish(message))
     watch = processes.start(sys.executable, "-c", code, name="watch")
     assert watch.wait_for("left:") == "left: 0"
     node.destroy_timer(timer)
@@ -95,7 +97,8 @@ def test_the_command_watch_shows_nodes_and_subscribes_to_no_commands_and_no_hand
     taken: set[str] = set()
 
     def look() -> bool:
-        with suppress(NodeNameNonExistentError):  # The command may not be known yet, or may just have ended.
+        # The call raises this error before the graph knows the command's node, and after the node has ended.
+        with suppress(NodeNameNonExistentError):
             taken.update(topic for topic, _ in node.get_subscriber_names_and_types_by_node(name, "/"))
         return "/left_q2r2_arm_controller/state" in taken
 

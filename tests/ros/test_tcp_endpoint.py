@@ -163,7 +163,7 @@ def test_a_headset_that_has_subscribed_gets_vibrations_byte_for_byte(node: Any, 
         headset.send(headset.registrations())
         headset.read_until("__topic_list")
         frame = None
-        while frame is None:  # Both sides may not know each other yet.
+        while frame is None:  # Publisher and endpoint need some time to discover each other.
             haptic.publish(OVR2ROSHapticFeedback(frequency=0.25, amplitude=7.0))
             with suppress(TimeoutError):
                 frame = headset.read_frame(0.2)

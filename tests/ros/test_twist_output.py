@@ -23,7 +23,7 @@ from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 from q2r2_control.teleop.arm_states import ArmState
 
 PERIOD = 0.01  # Period of the node's ticks [s].
-BASE = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2.0), np.array([0.0, 0.5, 0.0]))  # In the world frame.
+BASE = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2.0), np.array([0.0, 0.5, 0.0]))  # Pose in the world frame.
 TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.4]))
 
 

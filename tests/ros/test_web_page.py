@@ -34,7 +34,7 @@ from tests.support.processes import children
 
 CAMERA = {"front": {"topic": "/front/compressed"}}
 PATIENCE = 120.0  # Timeout for a whole set on a busy machine [s].
-RATE = 60.0  # The rate is a quarter of the default. The page shows the same, and six nodes share a busy machine [Hz].
+RATE = 60.0  # A quarter of the default, because six nodes share a busy machine. The page looks the same [Hz].
 # The program does the same as `q2r2 ros up`, with parameters that tolerate other load.
 SET = """
 import json, sys

@@ -106,7 +106,7 @@ def test_a_trajectory_of_the_output_is_written_and_read_as_by_rclpy(robot: Robot
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_a_trajectory_with_another_number_of_points_keeps_that_number(count: int) -> None:
+def test_a_trajectory_that_does_not_have_exactly_one_point_keeps_its_number_of_points(count: int) -> None:
     points = [JointTrajectoryPoint(positions=[1.0 * n]) for n in range(count)]
     message = JointTrajectory(joint_names=["a"], points=points)
     assert len(trajectory_reader()(serialize_message(message)).points) == count

@@ -119,7 +119,7 @@ class VirtualLbrs:
             act()
 
     def target(self, arm: str, pose: pin.SE3) -> None:
-        """Send a target of the operator, in order and at once."""
+        """Deliver a target of the operator at once. If the node is frozen, it gets its messages later, in order."""
         received = int(1e9 * self.now)
         info = {"publication_sequence_number": None, "source_timestamp": received, "received_timestamp": received}
         take = self._callbacks[f"/q2r2/{arm}/target_frame"]

@@ -81,7 +81,7 @@ def test_limits_in_degrees_are_a_fault_and_a_range_of_many_turns_is_no_fault(
     lower, upper, fastest = robot.position_lower.copy(), robot.position_upper.copy(), robot.velocity_limit.copy()
     for limits in (lower, upper, fastest):
         limits[2] = np.rad2deg(limits[2])
-    upper[3], fastest[4] = 100.0, 60.0  # One large limit alone may be right.
+    upper[3], fastest[4] = 100.0, 60.0  # A single large limit can be correct, so it is no fault.
     for name, limits in (("position_lower", lower), ("position_upper", upper), ("velocity_limit", fastest)):
         monkeypatch.setattr(robot, name, limits)
     (fault,) = preflight_faults(robot, SETTINGS, None)

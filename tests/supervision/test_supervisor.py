@@ -301,7 +301,7 @@ def test_a_stream_that_began_away_from_the_tool_is_followed_after_a_jump_to_the_
         assert stream.offer(raised(TOOL, 0.2), [TOOL], 0.0) is not None
     assert jumping.offer(TOOL, [TOOL], 0.01) is None
     assert silent.offer(raised(TOOL, 0.04), [TOOL], 0.01) is not None
-    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # This motion to the tool is too slow for a jump.
+    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # This motion to the tool is too slow to count as a jump.
     assert silent.offer(TOOL, [TOOL], 0.2) is None
 
 

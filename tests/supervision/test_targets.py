@@ -109,7 +109,7 @@ def test_sequence_numbers_that_start_again_after_a_silence_are_no_break() -> Non
 
 
 SENDER, LOOP = 0.005, 0.004  # Periods of the sender and of the loop [s].
-SPEED, RADIUS = 0.3, 0.1  # [m/s], [m]
+SPEED, RADIUS = 0.3, 0.1  # Speed [m/s] and radius [m] of the circle on which the target moves.
 
 
 def circling(t: float) -> pin.SE3:

@@ -117,7 +117,7 @@ class Watched:
         return self.guard.pose
 
     def step(self, target: pin.SE3 | None, dt: float = DT) -> pin.SE3:
-        if self.now + dt - self.now > LONGEST_DT:  # After such a gap the motion begins from rest.
+        if self.now + dt - self.now > LONGEST_DT:  # After a gap of this length, the motion begins from rest.
             self.velocity = np.zeros(3), np.zeros(3)
         before, last = self.pose, self.velocity
         self.now += dt

@@ -150,8 +150,8 @@ def test_when_the_hand_comes_back_the_target_starts_at_the_tool_and_follows_the_
     tied.go(out, 900)
     farthest, held = tied.hand, tied.target
     tied.go(-0.1 * out, 200)
-    # The target is as if the hand's farthest pose and the tool pose were the new anchors. Only the first part of the
-    # hand's return has no effect, because it may be tremor.
+    # The target is nearly where it would be if the hand's farthest pose and the tool pose were the new anchors. It
+    # differs a little, because the first part of the hand's return counts as tremor and has no effect.
     motion.anchor(farthest, TOOL)
     expected = motion.target(tied.hand)
     missing = expected.actInv(tied.target)
@@ -249,10 +249,10 @@ def test_a_blocked_arm_rests_and_then_follows_the_returning_hand_at_once_without
     assert way[held] - way[start] < farthest - 0.45  # The tool moved at least 0.45 m less than the hand.
     resting = (t > HELD - 0.5) & (t < HELD)
     acceleration = np.array([np.linalg.norm(tick.reference.a) for tick in ticks])[resting]
-    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # An arm in free motion has 0.39 rad/s^2.
+    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # For an arm in free motion, this value is 0.39 rad/s^2.
     assert speed[resting].max() < 0.01
-    # The hand comes back by 2 mm. An almost straight arm has moved by only a part of this at ``soon``. An arm that was
-    # pushed aside also comes back to its path, so it may move by more than 2 mm.
+    # The hand comes back by ``BACK``, which is 2 mm. At the time ``soon``, an almost straight arm has moved by only a
+    # part of ``BACK``. An arm that was pushed aside also comes back to its path, so it may move farther than ``BACK``.
     assert -2.0 * BACK < way[soon] - way[held] < -0.5 * BACK
     assert way[later] - way[held] > -2.0 * BACK
     assert speed[t >= HELD].max() < 0.05  # The hand comes back at 0.04 m/s.

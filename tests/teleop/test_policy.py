@@ -198,7 +198,7 @@ def test_unusable_actions_are_reported_once_while_no_arm_follows_the_policy() ->
     assert run.reasons() == ["policy_refused: policy_unusable"]
 
 
-def test_actions_with_times_of_another_clock_are_refused() -> None:
+def test_actions_are_refused_if_their_times_are_not_times_of_the_loops_clock() -> None:
     run = Run()
     run.tick(chunk(np.array([run.now + 1e9]), np.array([0.0])))
     assert run.reasons() == ["policy_refused: policy_unusable"]

@@ -110,7 +110,7 @@ class Terminal:
         threading.Thread(target=self._read, daemon=True).start()
 
     def wait_for(self, expected: str) -> None:
-        end = time.monotonic() + 60.0  # A machine may be slow.
+        end = time.monotonic() + 60.0  # This timeout is long, because a machine may be slow.
         while expected not in self.text:
             assert time.monotonic() < end, f"{expected!r} did not come; {self.text!r} did"
             time.sleep(0.01)

@@ -74,7 +74,7 @@ def test_only_the_servers_own_page_may_connect(door: Door) -> None:
         assert (status(door), status(door, f"/{token}")) == (403, 200)
     else:
         assert status(door) == 200
-        # An attacker may let this name refer to this computer.
+        # An attacker can let this host name refer to the address of this computer.
         assert status(door, Host=f"example.org:{door.port}") == 403
         assert status(door, Host="example.org:9000") == 403
 
@@ -84,7 +84,7 @@ def test_a_page_through_a_forwarded_port_may_connect_and_the_refusal_of_another_
 ) -> None:
     if door.token is not None:
         pytest.skip("beyond loopback the token decides")
-    assert status(door, Host="localhost:9000") == 200  # A browser sends this after ssh -L 9000:localhost:PORT.
+    assert status(door, Host="localhost:9000") == 200  # A browser sends this host after ssh -L 9000:localhost:PORT.
     request = Request("/", Headers({"Host": "example.org:9000"}))
     assert door.refusal(request) == (
         "unknown Host 'example.org:9000'; allowed: 127.0.0.1, [::1], localhost, at any port, "

@@ -126,7 +126,7 @@ def test_a_held_button_stays_held_while_other_keys_are_pressed_but_only_for_a_li
     assert held[-10:] == [False] * 10
 
 
-def test_a_tap_between_two_messages_is_in_the_next_message_if_this_is_sent_soon_and_for_the_same_hand(
+def test_a_tap_between_two_messages_is_in_the_next_message_if_that_message_is_sent_soon_for_the_same_hand(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")

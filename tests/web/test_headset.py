@@ -120,7 +120,8 @@ def test_hands_engage_the_arms_and_move_them_along_the_axes_of_the_room_and_feel
     felt = page.evaluate("vibrations.filter(one => one.amplitude > 0).map(one => one.hand)")
     assert {"left", "right"} <= set(felt)
     assert page.evaluate("pulses") > 3
-    page.evaluate("document.getElementById('leave').click()")  # The emulator covers the button.
+    # The emulator covers the button, so the mouse cannot click it.
+    page.evaluate("document.getElementById('leave').click()")
     wait_until(lambda: not page.evaluate("Boolean(headset.activeSession)"))
     run.interrupt()
     assert run.end()["at_rest"]

@@ -146,7 +146,7 @@ def test_a_page_that_does_not_drive_shows_the_driver_and_the_state_and_can_only_
     }""")
     wait_until(lambda: run.asked == ["stop"])
     driver.close()
-    wait_until(lambda: "connected" in other.inner_text("#link"))  # The other page may drive now.
+    wait_until(lambda: "connected" in other.inner_text("#link"))  # Now the other page is allowed to drive.
 
 
 def test_the_page_says_that_the_run_is_over_and_tries_to_connect_again(run: ShownRun, open_page: Open) -> None:

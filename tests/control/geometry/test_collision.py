@@ -110,8 +110,8 @@ def test_no_distance_changes_by_more_than_the_bound_computed_from_the_travel_of_
     q = random_posture(arrays.robot, random)
     other = np.clip(q + random.uniform(-size, size, len(q)), arrays.robot.position_lower, arrays.robot.position_upper)
     here, there = distances(arrays, np.array([q, other]))
-    # Pairs whose cores meet are not compared: if a segment enters a box over an edge, the direction of the shortest
-    # translation out of the box jumps.
+    # Pairs whose cores meet are not compared. If a segment enters a box over an edge, the shortest translation out of
+    # the box changes its direction suddenly.
     comparable = np.minimum(here, there) > _core_distance(arrays) + 1e-9
     excess = np.abs(here - there) - _way_bound(arrays, np.abs(other - q))
     assert excess[comparable].max() <= 1e-12

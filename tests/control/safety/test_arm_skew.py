@@ -22,7 +22,9 @@ WINDOW, PAIRS = 0.03, 8  # Largest delay of one arm behind the other arm [s], an
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", NAMES)
-def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_its_path(name: str, shape: int) -> None:
+def test_every_pair_keeps_the_distances_that_are_proven_for_it_wherever_each_arm_is_on_its_path(
+    name: str, shape: int
+) -> None:
     random, robot, model = np.random.default_rng(91), cell(name).robot, kernel_model(name).safety
     right, kept = robot.arms["right"].joints, model.min_distance.copy()
     bound_used: list[float] = []
@@ -58,7 +60,7 @@ def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_i
             bound_used.append((distance - least) / (distance - proven))
             for proof, other in ((1, 2), (2, 1)):  # Proof 2 uses four times as many instants as proof 1.
                 bend = data.history.bend[other].copy()
-                data.history.bend[other] = np.inf  # With this, the other proof proves nothing.
+                data.history.bend[other] = np.inf  # With an infinite bend, the other proof proves nothing.
                 proven = _largest(partial(keeps_apart_at_any_time, model, data, p, duration), distance)
                 data.history.bend[other] = bend
                 assert least >= proven - 1e-8

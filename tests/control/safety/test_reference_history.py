@@ -41,7 +41,7 @@ def test_no_joint_was_farther_from_its_present_position_during_the_window_than_t
         assert (history.travel <= 3.0 * travel + 1e-6).all(), "the bound is not far too large"
 
 
-def test_after_the_window_was_0_the_known_part_of_a_new_window_starts_at_0_and_grows_with_each_step() -> None:
+def test_if_the_window_was_0_a_longer_window_is_unknown_at_first_and_each_step_adds_to_the_known_part() -> None:
     robot, data = cell(NAMES[0]).robot, kernel_data(NAMES[0], cell(NAMES[0]).robot.home).safety
     history, still = data.history, np.zeros(robot.model.nv)
     history.window[1] = WINDOW

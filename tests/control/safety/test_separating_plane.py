@@ -56,7 +56,7 @@ def test_a_proven_distance_holds_during_the_whole_step_and_is_often_close_to_the
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_pair_that_opens_from_exactly_its_threshold_is_proven_to_stay_beyond_the_threshold(name: str) -> None:
-    """A bound that uses only the distance at the start would fail: it needs a free distance for half of the travel."""
+    """A bound from the first distance and the travel alone cannot prove this: the pair has no distance to spare."""
     random, robot = np.random.default_rng(22), cell(name).robot
     parted = 0
     for _ in range(40):

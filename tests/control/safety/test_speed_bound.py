@@ -16,9 +16,9 @@ from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
 def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
-    """Return the data of the certificate before it examines pairs, and h + T / 2 [s].
+    """Return the data that the certificate has before it examines pairs, and the time h + T / 2 [s].
 
-    h is the duration of the step, and T is the duration of the stop.
+    The step takes h, and the stop takes T.
     """
     model, data = kernel_model(name).safety, reused_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
@@ -113,7 +113,7 @@ def test_the_speed_bound_holds_and_is_tight_if_all_joints_stop_together(speed: f
         closer, bound = now - least_along("dual_iiwa7", motion), now - bounds_of("dual_iiwa7", motion)
         assert (closer <= bound + 1e-12)[apart].all()
         used.append((closer / bound)[apart].max())
-    assert np.median(used) > 0.6  # A smaller value would show that the bound is too weak to be useful.
+    assert np.median(used) > 0.6  # A smaller median would show that the bound is too weak to be useful.
 
 
 @pytest.mark.parametrize("shape", [TOGETHER, OWN])

@@ -100,8 +100,8 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_clearly_safe_motions_
 def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
     """Yield two motions for each of ``count`` starts. Both have the same start and direction.
 
-    In the first motion, a pair comes slightly closer than the required distance. In the slower second motion, no pair
-    does.
+    In the first motion, a pair comes slightly closer than the required distance. The second motion is slower, and every
+    pair keeps the required distance.
     """
     found = 0
     for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):
@@ -207,7 +207,7 @@ def test_a_step_that_brings_a_too_close_pair_closer_is_refused_even_if_the_pair_
     for q in _too_close(cell(name), np.random.default_rng(22), 200):
         apart = distances(cell(name), q[None])[0]
         if np.partition(apart, 1)[1] < MIN_DISTANCE:
-            continue  # Another pair is too close and could be the reason.
+            continue  # The step might be refused because of a second pair that is too close.
         gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, apart.argmin()] - apart.min()) / 1e-6
         parting = 0.01 * gradient / np.linalg.norm(gradient) ** 2  # The pair parts at 0.01 m/s.
         if _certified(name, motion_of(name, q, parting, parting)):

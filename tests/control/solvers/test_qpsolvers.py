@@ -32,7 +32,7 @@ FAR_M = 2e-3  # Largest distance of a tool from its position with DAQP. It allow
 @contextmanager
 def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
     """Fail if something is printed in the block, also by a library, or if there is a warning."""
-    capfd.readouterr()  # This output came from making the solvers: HiGHS prints a line on stderr once.
+    capfd.readouterr()  # Output from before the block is dropped: HiGHS prints a line when it is made.
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield

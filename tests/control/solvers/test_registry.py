@@ -14,7 +14,7 @@ from tests.control.cells import cell
 ROBOT = cell("dual_iiwa7").robot
 
 
-def test_an_unknown_solver_raises_an_error_of_one_line_with_the_installed_solvers_and_how_to_install_others() -> None:
+def test_the_error_for_an_unknown_solver_names_the_installed_solvers_and_says_how_to_install_other_solvers() -> None:
     with pytest.raises(ConfigError) as caught:
         CartesianController(ROBOT, ControllerSettings(solver="osqb"))
     line = str(caught.value)

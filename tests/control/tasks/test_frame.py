@@ -128,8 +128,9 @@ def test_the_cost_of_a_tool_is_the_weighted_square_of_its_twist_error() -> None:
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)
 
 
-# Position weights, rotation weights, whether the tool reaches the target's x, y and z, and whether it reaches the
-# direction of the target's z axis.
+# Columns 1 and 2: the weights of the position and of the rotation.
+# Column 3: True for each of x, y and z at which the tool reaches the position of the target.
+# Column 4: True if the tool's z axis reaches the direction of the target's z axis.
 PARTS = {
     "position only": ((1, 1, 1), (0, 0, 0), (True, True, True), False),
     "rotation only": ((0, 0, 0), (1, 1, 1), (False, False, False), True),

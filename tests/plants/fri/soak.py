@@ -116,7 +116,8 @@ class Soak:
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
         self._late, self._ends = {"computer freezes"}, list(_ENDS)
         if self.pipeline.drive.mode is CommandMode.TORQUE:
-            self._late.add("loop freezes")  # With torques, a session then ends by itself, because no torques come.
+            # If the loop freezes, no torques come, and a session in torque mode ends by itself.
+            self._late.add("loop freezes")
             # The simulated arm keeps its last torque while its cabinet stands still.
             self._ends.remove("cabinet freezes")
         self._returns = False
@@ -168,7 +169,7 @@ class Soak:
             self._end_session(now)
 
     def _look_at_rest(self, now: float, held: bool, still: float) -> None:
-        """Wait until the arms have settled, or until they move faster than they may."""
+        """Wait until the arms have settled, or until they move faster than is allowed."""
         rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
         settled = passed >= rest.settled_after
         allowed = max(rest.settled if settled else rest.slow, still)
@@ -196,7 +197,7 @@ class Soak:
         pause = float(self.random.uniform(0.02, 0.5))
         if self._end in ("pendant", "back at once"):
             cabinet.stop()
-            if self._end == "back at once":  # The session is back before the arms rest.
+            if self._end == "back at once":  # The overlay starts again before the arms rest.
                 cabinet.start_overlay()
         elif self._end == "safety stop":
             cabinet.safety_stop(Safety.STOP_1_ON_PATH)

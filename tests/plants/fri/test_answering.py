@@ -127,7 +127,7 @@ def test_the_process_ends_when_the_loop_ends(between: Between) -> None:
 @pytest.mark.slow
 def test_the_process_goes_on_after_the_end_of_the_loop_until_the_arms_rest() -> None:
     with between_of(LongMotion(ANSWERS)) as between:
-        between.process._commands.close()  # This pipe is closed too when the loop's process ends.
+        between.process._commands.close()  # If the loop's process ends, this pipe is closed in the same way.
         while between.sent < ANSWERS:
             assert between.ask().reflected == between.sent
         between.process.close()

@@ -43,7 +43,7 @@ class Client:
 
 
 def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Monitoring:
-    """Let the client answer for ``periods`` periods. Return the next message."""
+    """Let the client answer for ``periods`` periods. Return the message that follows."""
     for period in range(periods):
         message = cabinet.send(period * cabinet.settings.period)
         if (command := answer(message)) is not None:
@@ -165,11 +165,11 @@ def test_an_answer_that_no_cabinet_would_follow_ends_the_session_and_the_arm_hol
     assert message.q == HOME
 
 
-def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_does_not_count() -> None:
+def test_invalid_answers_and_answers_of_a_wrong_fri_version_end_the_session_and_a_late_answer_does_not_count() -> None:
     endless, nowhere = (math.inf,) * 7, (math.nan, *HOME[1:])
     for datagram, trip in (
         (b"hello", Trip.MALFORMED),
-        # The identifier is that of a message, and not of an answer.
+        # This datagram has the identifier of a message. An answer has another identifier.
         (write_monitoring(Cabinet(SETTINGS, StillArm(HOME)).send(0.0)), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=nowhere), 2), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=HOME, tau=endless), 2), Trip.MALFORMED),
@@ -186,7 +186,7 @@ def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_do
 def test_missed_answers_are_counted_only_if_the_client_answers_again() -> None:
     cabinet, client = commanding()
     run(cabinet, 100, lambda message: client.answer(message) if message.counter % 20 else None)
-    assert cabinet.missed == 6  # One of the six is the last message in ``commanding``.
+    assert cabinet.missed == 6  # Five answers are missed in ``run``, and one after the last message in ``commanding``.
     run(cabinet, 20, lambda message: None)
     assert (cabinet.missed, cabinet.trips) == (6, [Trip.LATE])
 

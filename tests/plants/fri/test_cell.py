@@ -222,7 +222,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
     plant = started(pipeline)
     sent: dict[str, list[tuple[float, Joints]]] = {arm: [] for arm in SIDES}
     plant.on_message = lambda arm, t: sent[arm].append((t, plant.cabinets[arm].commanded))
-    newest: list[Tick] = []  # The tick before the tick in which the solver blocks.
+    newest: list[Tick] = []  # Contains the tick before the tick in which the solver blocks.
     decelerations: list[np.ndarray] = []
 
     def block(tick: Tick) -> None:
@@ -315,7 +315,7 @@ def test_if_the_measured_state_is_not_trusted_the_arms_are_braked_at_every_tick(
     assert len(brakings) > 4
     for speeds in brakings[:-1]:
         assert max(speeds) < speeds[0] + 0.2, "a jump of what is measured is hardly a push"
-        # By then, the periods of both cabinets and the effect of the jump in the filter of the velocity are over.
+        # After 20 ticks, the current period of each cabinet is over, and the filtered velocity contains no jump.
         later = np.array(speeds[20:])
         assert (np.diff(later) < 0.01 * later[:-1] + 1.0 / config.nominal_rate_hz).all(), "no arm gets faster"
         assert later[-1] < 0.02, "and both rest before they are believed again"

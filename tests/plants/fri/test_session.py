@@ -101,7 +101,7 @@ def test_a_torque_that_is_not_updated_is_replaced_by_a_braking_torque_and_later_
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
 
 
-def test_a_braking_torque_changes_at_most_by_the_rate_limit_or_by_5000_nm_s_if_the_limit_is_lower() -> None:
+def test_a_braking_torque_changes_no_faster_than_the_rate_limit_which_counts_as_at_least_5000_nm_s() -> None:
     for rate, change in ((6000.0, 30.0), (100.0, 25.0)):
         cabinet = torque_cabinet(rate=rate)
         active, still, ones = begin_torques(cabinet), (0.0,) * 7, (1.0,) * 7
@@ -168,7 +168,7 @@ def test_if_the_command_of_one_arm_is_late_both_commands_are_refused_and_both_ar
     cabinet, still, ones = Cabinet(), (0.0,) * 7, (1.0,) * 7
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
-    for _ in range(10):  # The reference leaves IPO at 1 rad/s^2 for 50 ms.
+    for _ in range(10):  # The reference accelerates from the posture IPO at 1 rad/s^2 for 50 ms.
         end = cabinet.now + 0.003
         passed = end - 0.013
         way, speed = 0.5 * passed**2, passed
@@ -253,7 +253,7 @@ def test_if_an_arm_begins_to_move_while_answers_are_lost_it_begins_from_rest() -
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.15
 
 
-def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> None:
+def test_a_cabinet_that_is_silent_or_asks_for_a_wrong_kind_of_commands_is_a_fault() -> None:
     cabinet = Cabinet()
     kinds = []
     for now in (0.0, 0.3):
@@ -295,7 +295,7 @@ def test_a_repeated_message_gets_the_same_answer_and_moves_nothing() -> None:
     for doubled, cabinet in cabinets.items():
         cabinet.ask(WAITING)
         cabinet.ask(ACTIVE)
-        for t in np.linspace(0.005, 0.1, 20):  # The reference leaves IPO at 1 rad/s^2.
+        for t in np.linspace(0.005, 0.1, 20):  # The reference accelerates from the posture IPO at 1 rad/s^2.
             end, there = cabinet.now + 0.003, tuple(q + 0.5 * t**2 for q in IPO)
             cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (t,) * 7, ones))
             answer = cabinet.ask(replace(ACTIVE, q=there), doubled=doubled)

@@ -36,7 +36,7 @@ def test_if_a_cabinet_is_silent_during_motion_its_arm_brakes_as_certified_and_fo
 
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
-    for t in np.linspace(0.005, 0.1, 20):  # The reference leaves IPO at 1 rad/s^2.
+    for t in np.linspace(0.005, 0.1, 20):  # The reference accelerates from the posture IPO at 1 rad/s^2.
         command(0.5 * t**2, t)
         ask()
     assert follows()

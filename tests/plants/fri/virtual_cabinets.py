@@ -81,7 +81,7 @@ class VirtualCabinets:
             self.lines[arm] = ArmSession(arm, "cabinet", None, _KINDS[self._mode], *limits)
         states = [copy(session.state) for session in self.lines.values()]
         self.cell = FriCell(self._robot, states, self._period, self._longest, self._grippers)
-        self.now, self._serial = _BEGIN, 0  # The loop begins at 0.
+        self.now, self._serial = _BEGIN, 0  # The loop begins later, at the time 0.
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
         # For each arm, the positions that its cabinet follows. With torques, they are the measured positions.
         self.heard: dict[str, list[Array]] = {arm: [] for arm in self.cabinets}

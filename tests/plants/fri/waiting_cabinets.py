@@ -41,7 +41,7 @@ def waiting_cabinets(
                 return opened.recv(2000)
             except TimeoutError:
                 continue
-            except OSError:  # No program listens there.
+            except OSError:  # No program listens at the client's address.
                 done.wait(_LOOKS)
                 break
         return None
