@@ -90,7 +90,7 @@ def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
             answer(CameraLost(str(error)))
         device.close()
         if camera.device_kind == "file":
-            # This process then only waits, because a video that has ended does not begin again.
+            # A video that has ended does not begin again, so this process only waits until the run ends.
             threading.Event().wait()
         device = _opened_anew(camera)
 

@@ -16,7 +16,7 @@ from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
 _WAITING = 256  # Greatest number of a camera's pictures that wait for ``take``. If more come, the oldest are lost.
-_READY = 120.0  # Longest wait for a camera's first picture [s]. A busy computer may need so long.
+_READY = 120.0  # Longest wait for a camera's first picture [s]. A busy computer starts a camera's process slowly.
 _Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks whether a picture has come [s].
 

@@ -114,7 +114,8 @@ class RealSense:
         if frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock:
             stamp_ms = frame.get_timestamp() + 1e3 * _monotonic_minus_unix_time()
         captured = capture_time(received, stamp_ms, self._camera.delay)
-        pixels = turned(np.array(frame.get_data()), self._camera)  # A copy, because the library reuses its memory.
+        # The pixels are copied, because the library reuses the memory of its frames.
+        pixels = turned(np.array(frame.get_data()), self._camera)
         if frame.is_depth_frame():
             return DepthCapture(captured, pixels, frame.as_depth_frame().get_units())
         return Capture(captured, pixels)
