@@ -150,7 +150,7 @@ DeviceText = Annotated[LocalPath, Field(min_length=1, max_length=500)]
 _LEAST_DISTANCE = 1e-6  # Least distance between a camera and the point that it looks at [m].
 _POSE_KEYS = ("position", "look_at", "rpy")  # Keys that only a simulated camera has.
 _DEVICE_KEYS = ("exposure", "rotation", "delay", "repeat", "depth")  # Keys that only a device has.
-REALSENSE = "realsense:"  # How ``device`` of a RealSense camera begins. A serial number follows.
+REALSENSE = "realsense:"  # The beginning of ``device`` for a RealSense camera. A serial number follows.
 
 
 class CameraConfig(StrictModel):
