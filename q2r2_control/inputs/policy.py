@@ -300,7 +300,7 @@ class PolicyInput:
         """Return the tool poses (n, 7) of each arm at joint positions (n, nv)."""
         robot = self._robot
         assert robot is not None
-        data = robot.model.createData()  # Each call has its own data, since any thread may send.
+        data = robot.model.createData()  # Each call makes its own data, because any thread may call ``send``.
         tools = {arm: np.empty((len(postures), 7)) for arm in robot.arms}
         for index, q in enumerate(postures):
             pin.forwardKinematics(robot.model, data, q)

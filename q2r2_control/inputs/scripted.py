@@ -202,7 +202,7 @@ _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of 
 # The headset loses the hands once. These are the times from this loss [s] until the headset sees the hands again, until
 # the hands engage the arms, until they begin to carry again, and until they continue the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
-# The headset loses the hands after a fraction of the work in this range. So early, no tool presses on a part yet.
+# The headset loses the hands when a fraction of the work in this range is done. No tool presses on a part by then.
 _EARLY = (0.1, 0.45)
 _NO_PRESS = (0.3, 0.6)  # Hands do not hesitate within these times before and after a press [s].
 
