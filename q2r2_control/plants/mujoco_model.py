@@ -46,8 +46,9 @@ _NEGLIGIBLE_INERTIA = 1e-6
 # Coefficients of friction of rubber pads on a box: sliding, torsional [m] and rolling [m].
 _PAD_FRICTION = (1.0, TORSION, ROLLING)
 
-# Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales their stiffness with the inertia behind
-# them, which is small in a finger. With MuJoCo's usual 0.02 s the fingers would sink millimetres into the held part.
+# Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales the stiffness of a contact with the inertia
+# of its bodies, and a finger has little inertia. With MuJoCo's usual time constant of 0.02 s, the fingers would sink
+# millimetres into the held part.
 _PAD_STIFFNESS = (0.004, 1.0)
 
 # Formats of meshes that MuJoCo reads by itself.

@@ -9,7 +9,7 @@ from q2r2_control.robot.floor import FLOOR
 with importing("sim", "the simulation in MuJoCo"):
     import mujoco
 
-# Geom groups. MuJoCo's viewers draw 0 to 2, and others only on request.
+# Groups of geoms. MuJoCo's viewers draw the groups 0 to 2. They draw the other groups only on request.
 VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 
 

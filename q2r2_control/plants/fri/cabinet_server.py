@@ -97,7 +97,7 @@ class SimulatedArm:
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Return the wanted position (n,) [rad] and velocity (n,) [rad/s] of the drives at ``t`` [s]."""
         share, change = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # When the next message is in time, ``share`` is 1, and the drives still move.
+        if share > 1.0 + _ROUNDING:  # If the next message is in time, ``share`` is 1 then, and the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * change), change / self._lasts
 

@@ -130,7 +130,7 @@ class FriCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # The command of a reference at rest has no deceleration. Any positive number is then allowed here.
+            # If the reference rests, the command has no deceleration. Any positive number can be used instead.
             stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -145,7 +145,8 @@ class FriCell:
     def fault(self) -> Reason | None:
         """Return why the arms cannot be commanded at the newest tick.
 
-        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        If they can be commanded now, but could not at some time since the previous call of this method, return the
+        reason for that. Otherwise, return None.
         """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
@@ -160,7 +161,7 @@ class FriCell:
         return {arm: state.ended for arm, state in self.states.items()}
 
     def sent(self, taken: bool) -> None:
-        """Record whether the sessions have ``taken`` the commands of a tick, or one of them came too late."""
+        """Record whether the sessions have ``taken`` the commands of a tick. If one came too late, they took none."""
         self._withdraws = not taken
         if taken:
             self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
@@ -216,10 +217,10 @@ class FriCell:
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Return the measurements in the cabinets' newest messages. The stamp is the earliest arrival of these.
+        """Return the measurements in the cabinets' newest messages. The stamp is the earliest arrival of a message.
 
-        The held posture of an arm that can be commanded by positions is the end of its path. Other arms have the
-        measured posture there.
+        If an arm can be commanded by positions, its held posture is the end of its path. The held posture of any other
+        arm is its measured posture.
         """
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         knows_external = True

@@ -289,7 +289,7 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
     """Let every arm take its command, and return True.
 
     If a command came too late, no arm takes its command, and False is returned. The arms then follow the certified stop
-    of the command before.
+    of the previous command.
     """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
