@@ -107,7 +107,7 @@ def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
         return "no SCHED_FIFO: only asked for on Linux"
     try:
         for thread in threads:
-            with suppress(ProcessLookupError):  # The thread has ended meanwhile.
+            with suppress(ProcessLookupError):  # The call fails if the thread has ended meanwhile.
                 os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         return f"no SCHED_FIFO: {error.strerror}"
