@@ -52,8 +52,8 @@ _deadline = math.inf  # Time of the steady clock at which this process must have
 # The profile of a receiver of commands. Only the newest command counts, and it must arrive.
 COMMAND_QOS = QoSProfile(depth=1)
 # The profile of a sender of commands. A reliable sender repeats messages that have not arrived, also after the network
-# was down for a while. An old target would let the arm jump. The lifespan is measured by the sender's clock, and the
-# clock of the receiver may differ.
+# was down for a while. An old target would let the arm jump, so messages have a lifespan. It is measured by the
+# sender's clock, which can differ from the receiver's clock.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
 # the next one. A reliable subscription delivers in order: after a lost message, later messages would wait up to 3 s.
@@ -203,7 +203,10 @@ class BaseNode(Node):
         super().destroy_node()
 
     def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> Reason | None:
-        """Return a reason if ROS time is simulated and has stood still for ``timeout`` [s] between calls, else None."""
+        """Return a reason if ROS time is simulated, and has not begun or stands still; else None.
+
+        It stands still if all calls of this method in the last ``timeout`` [s] of real time saw the same ROS time.
+        """
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
@@ -329,7 +332,8 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
         end_in_time()
         if executor is not None:
-            executor.shutdown()  # Otherwise Python destroys its parts in any order, and rclpy prints a traceback.
+            # Without this call, Python would destroy the executor's parts in any order. rclpy would print a traceback.
+            executor.shutdown()
         for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()

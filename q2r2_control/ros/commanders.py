@@ -122,7 +122,7 @@ class CommandWatch:
         return self._found
 
     def named(self, reason: Reason) -> Reason:
-        """Return the reason with the names of its nodes, if they were unknown before and are known by now."""
+        """Return ``reason``. If names of nodes were unknown when it was made, it gets the names that are known now."""
         if reason.kind is not RosReason.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
             return reason
         return self._reason(reason.detail["topic"])

@@ -68,7 +68,7 @@ class ArmOutputs:
         self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
         self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
-            # The timeout is twice the usual one, because a target must arrive before the answer can be sent.
+            # The timeout is twice the usual timeout, because the controller reports only after a target has arrived.
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         service = preset.command_type
         self._command_type = (
@@ -108,7 +108,7 @@ class ArmOutputs:
 
     @property
     def homing(self) -> tuple[bool, Reason | None]:
-        """Whether the built-in controller reports a motion home, and how the last motion home ended, or None."""
+        """Whether the built-in controller reports a motion home, and how the last one ended (None if not known)."""
         return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
@@ -146,7 +146,7 @@ class ArmOutputs:
             return None
         if (distance := self._stands.look(asked.translation, tool.translation, received, now)) is None:
             return None
-        self.forget(now)  # A repeated target could make the arm jump.
+        self.forget(now)  # If the last target were sent again, the arm could jump.
         takers = f" {name}" if (name := takers_of(self._node, self.first.topic)) else ""
         return _refused(standing(self._arm, takers, distance, "m"))
 
@@ -250,7 +250,8 @@ class FollowWatch:
             self._since = math.inf
             self._followed_since = min(self._followed_since, now) if followed else math.inf
             return None
-        # If the controller seemed to follow for less than _ANSWER, the report about an earlier stream's end came late.
+        # If the controller seemed to follow for less than _ANSWER, it never followed this stream. Its report that an
+        # earlier stream had ended came late.
         dropped = now - self._followed_since > _ANSWER
         self._since, self._followed_since = min(self._since, now), math.inf
         if not (dropped or now - self._since > self._timeout):

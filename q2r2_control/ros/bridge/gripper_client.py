@@ -90,7 +90,7 @@ class GripperClient:
         self._begins = False  # True until the first command for the last request is sent.
         self._commanded_at = -math.inf  # Time of the last command [s].
         self._waits = False  # True while only a part of the requested motion is granted.
-        self._closes = False  # Whether the last request is a smaller opening than the request before.
+        self._closes = False  # Whether the last request is a smaller opening than the previous request.
         self._goals = 0
         self._publisher = self._client = None
         if settings.action_type is GripperType.FLOAT64_MULTI_ARRAY:

@@ -25,7 +25,7 @@ from q2r2_control.types import Array
 
 _LITTLE_ENDIAN = b"\x01"  # The second byte of a serialized message.
 _STAMP = struct.Struct("<iI")
-_SECOND, _NANOSECOND = 0x1BADF00D, 987_654_321  # No other part of a template has these values.
+_SECOND, _NANOSECOND = 0x1BADF00D, 987_654_321  # They mark a stamp: no other part of a template has these values.
 _KEPT = 16  # Number of layouts that are remembered for each kind of message.
 
 

@@ -104,7 +104,7 @@ def build_missing(report: Callable[[str], None]) -> None:
 def missing_tools(prefix: Path) -> list[str]:
     """Return one text for each thing that a build into ``prefix`` lacks. The text says where to get it."""
     missing = []
-    # Python's own folder is compared with this one, because Debian's own Python imports from another folder.
+    # ``packages`` is compared with Python's own folder, because Debian's own Python imports from another folder.
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")

@@ -260,8 +260,8 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # If the safe target is away from an arm that holds, each press would engage the arm, and it would stop at once.
-        # It is therefore unready. An arm that follows may lag behind the safe target.
+        # If the safe target is far from an arm that holds, a press would engage the arm, and it would stop at once. The
+        # arm is therefore unready. An arm that follows may lag behind the safe target.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:

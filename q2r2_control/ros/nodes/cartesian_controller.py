@@ -151,12 +151,12 @@ class CartesianControllerNode(ManagedNode):
     def _tick(self) -> None:
         decided = time.monotonic()
         if self._output.waits():
-            return  # This tick is missed, and the next one is late.
+            return  # Nothing is sent in this tick, and the next tick counts as late.
         now = self._clock_of_ticks.at(self.now)
         # ``dt`` is bounded, so that a late tick causes no jump, and a clock that was set back causes no motion.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # The gap is longer than the time that states may be missing.
+        if gap > max(LONGEST_DT, self._watch.timeout):  # The node stood still longer than joint states may be missing.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1

@@ -67,7 +67,7 @@ class _Motion:
 
 
 class GripperServer:
-    """Serves the action ``topic`` of a gripper. A new goal aborts the goal before.
+    """Serves the action ``topic`` of a gripper. A new goal aborts the previous goal.
 
     If the fingers stop on an object, the goal has succeeded, and its result says ``stalled``.
 
@@ -231,7 +231,7 @@ class MujocoRobot(BaseNode):
     ) -> None:
         try:
             message = read(data)
-        except SerdeError:  # The sender is at fault.
+        except SerdeError:  # The bytes are no valid message. This is a fault of the sender.
             self.drop(_TRAJECTORY, f"{len(data)} bytes")
             return
         take(message, info)

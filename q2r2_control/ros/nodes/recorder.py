@@ -145,7 +145,7 @@ class RecorderNode(BaseNode):
             text = deserialize_message(payload, String).data
             try:
                 event = Event.from_json(json.loads(text))
-            except (ValueError, TypeError, KeyError):  # The message is in the file, but belongs to no episode.
+            except (ValueError, TypeError, KeyError):  # The message is recorded, but no event can be read from it.
                 self.drop(topic.name, f"{text!r:.60}")
                 return
             self._marks.follow(event.kind)
