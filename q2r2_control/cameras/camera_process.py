@@ -23,7 +23,7 @@ from q2r2_control.errors import CameraError
 _NICENESS = 15
 _QUALITY = 90  # The quality of JPEG pictures, from 0 to 100.
 _RETRY = 0.5  # Time between two attempts to open a camera that was lost [s].
-_EARLY = 0.4  # A picture is kept if it comes before it is due, but by at most this share of a period.
+_EARLY = 0.4  # A picture that comes before it is due is kept if it is early by at most this share of a period.
 
 
 class CameraShot(NamedTuple):

@@ -50,11 +50,11 @@ class CameraStream:
         self._hearers.append(hearer)
 
     def take(self) -> list[tuple[float, CameraShot]]:
-        """Return the pictures since the last call, each with the time of its receipt [s]. This method never waits."""
+        """Return the pictures since the previous call, each with its time of receipt [s]. This method never waits."""
         return _taken(self._waiting)
 
     def take_depths(self) -> list[DepthShot]:
-        """Return the depth pictures since the last call. This method never waits."""
+        """Return the depth pictures since the previous call. This method never waits."""
         return _taken(self._depths)
 
     def first_picture(self) -> CameraShot:

@@ -119,7 +119,7 @@ class CameraWatch:
         return self._tell(CameraReason.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
 
     def _tell(self, kind: ReasonKind, is_so: bool, **detail: Any) -> list[Reason]:
-        """Return a reason of this ``kind`` if the fault is present (``is_so``) and was absent at the last call."""
+        """Return a reason of this ``kind`` if the fault is present (``is_so``) and was absent at the previous call."""
         was_told = kind in self._told
         (self._told.add if is_so else self._told.discard)(kind)
         return [self._reason(kind, **detail)] if is_so and not was_told else []

@@ -147,7 +147,7 @@ class RealSense:
 def _monotonic_minus_unix_time() -> float:
     """Return the monotonic time minus the Unix time [s].
 
-    The clocks are read one after the other. The readings between which the least time has passed are used.
+    The clocks are read one after the other, three times. The readings that were made in the shortest time are used.
     """
     found = []
     for _ in range(3):

@@ -124,6 +124,6 @@ def _answers(
     for index in range(_MOST):
         try:
             answer = ioctl(file, request, form.pack(*asked(index)))
-        except OSError:  # The list has no more entries.
+        except OSError:  # The request fails if the list has no more entries.
             return
         yield form.unpack(answer)
