@@ -144,7 +144,7 @@ class _Loader(SafeLoader):
         seen: set[Any] = set()
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
-                continue  # With `<<: *other`, keys of the mapping itself may replace the merged ones.
+                continue  # With `<<: *other`, keys of the mapping itself are allowed to replace merged keys.
             key = self.construct_object(key_node, deep=True)
             if key in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)

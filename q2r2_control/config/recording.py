@@ -17,7 +17,7 @@ SubtaskSeconds = Annotated[float, Field(ge=0, le=3600)]
 
 
 class JudgeSettings(StrictModel):
-    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. A threshold of null is not checked.
+    """Thresholds of ``q2r2 judge``: an episode that fails any of them is discarded. A threshold of null is not checked.
 
     Shares are fractions of the time for which an arm is engaged, unless a description says otherwise. No threshold thus
     depends on the length of an episode. The package ``q2r2_control.judging`` computes the numbers.
