@@ -115,7 +115,7 @@ class HeadsetServer:
 
     @property
     def driver(self) -> str | None:
-        """The address of the headset that drives; None if none does."""
+        """The address of the headset that drives; None if no headset drives."""
         return self._stream.peer
 
     def poll(self, now: float) -> list[HandSample]:

@@ -18,7 +18,7 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures larger ones [m].
+_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures larger coordinates [m].
 
 
 class Move(NamedTuple):

@@ -26,7 +26,7 @@ class PageClient(Peer):
 
     def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
         # A page keeps its number ``page`` when it is reloaded. Like the app's registrations, the number shows that a
-        # new connection is from the same page as before.
+        # new connection is from the same page as an earlier connection.
         super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
         self.connection = connection
         self.newest: PageMessage | None = None  # The newest message; None if it has been passed on.
