@@ -145,9 +145,10 @@ class SessionPlant(Protocol):
         """
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded now, or why they could not at some time since the last call.
+        """Return why the arms cannot be commanded now.
 
-        The result is None if the arms could always be commanded.
+        If they can be commanded now, but could not at some time since the previous call of this method, return the
+        reason for that. Otherwise, return None.
         """
 
     def sessions(self) -> dict[str, str]:

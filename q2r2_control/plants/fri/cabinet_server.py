@@ -274,7 +274,7 @@ class CabinetServer:
         while True:
             try:
                 datagram, source = self._sockets[arm].recvfrom(LONGEST + 1)
-            except OSError:  # There are no more datagrams, or no client listens yet.
+            except OSError:  # Reading fails if there are no more datagrams, or if no client listens yet.
                 return
             if source[:2] == self._clients[arm]:
                 for late in self._delays(0.0):
@@ -298,7 +298,7 @@ class CabinetServer:
 def _sent(opened: socket.socket, datagram: bytes, client: tuple[str, int]) -> None:
     try:
         opened.sendto(datagram, client)
-    except OSError:  # No client listens yet.
+    except OSError:  # Sending fails if no client listens yet.
         return
 
 

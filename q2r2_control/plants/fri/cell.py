@@ -27,8 +27,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Command, CommandMode, RobotState
 
 # Time that is allowed from the start of a tick until the sessions have its commands [s]. The first value is the usual
-# one. After commands that came too late, it grows up to the second value, and the reference goes farther ahead by the
-# difference.
+# time. After commands that came too late, the time grows up to the second value, and the reference goes farther ahead
+# by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Shortest step of the reference, as a share of the loop's period.
 _SHORTEST = 0.5

@@ -24,7 +24,7 @@ from q2r2_control.plants.fri.wire import (
 from q2r2_control.types import Array
 
 # An answer is for a time that is this much earlier than the arrival of its question [s]. Even on a busy computer, the
-# loop has computed the reference for this time by then.
+# loop has computed the reference for that time before the question arrives.
 DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
@@ -34,8 +34,8 @@ _MOST_AHEAD = 20
 # A torque without updates would push for ever. If it is older than the first of these times [s], it is replaced by a
 # torque that brakes. If it is older than the second time [s], the cabinet gets no answer, so that it ends the session.
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-# If the limit of the torques' rate is below this value, it is raised to it [Nm/s]. With the original limit, the damping
-# would come too late.
+# Least limit of the torques' rate [Nm/s]. A lower limit is raised to this value, because the damping would otherwise
+# come too late.
 _BRAKING_RATE = 5000.0
 # Greatest distance at which a reference may begin [rad]: with positions, from the position in which the arm is held;
 # with torques, from the arm's measured position.
@@ -46,7 +46,8 @@ _FROM_REST = 20.0  # Upper bound on the acceleration of a joint in the first tic
 class ArmSession:
     """The session of one arm.
 
-    While the arm follows the reference, the positions in its answers lie on ``path``. Otherwise they keep it at rest.
+    While the arm follows the reference, the positions in its answers lie on ``path``. At all other times, the positions
+    keep the arm at rest.
     """
 
     def __init__(
