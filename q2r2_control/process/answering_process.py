@@ -81,7 +81,7 @@ class AnsweringProcess:
         return word == self.TAKEN
 
     def said(self) -> Iterator[bytes]:
-        """Yield the states, as bytes, that the process has sent since the last call.
+        """Yield the states, as bytes, that the process has sent since the previous call of this method.
 
         Raises:
             PlantError: If the process has ended.

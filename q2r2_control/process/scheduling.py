@@ -17,7 +17,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 
-# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some of them and needs a lower one.
+# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some interrupts, so that it needs a
+# lower priority.
 _PRIORITY = 40
 LONGEST_END = 5  # Time that a process may take to end after it has closed everything. SIGALRM ends it then [s].
 _CURRENT, _FUTURE = 1, 2  # Flags of mlockall on Linux.
