@@ -73,7 +73,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class BaseNode(Node):
     """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String)."""
 
-    exit_code: int | None = None  # As soon as it is set, the executable ends with this exit code.
+    exit_code: int | None = None  # As soon as this exit code is set, the executable ends with it.
     ticks = False  # True if messages are taken only at the node's ticks, see TickExecutor.
     priority = 0  # Real-time priority, if the system permits it; 0 for the ordinary priority.
 
@@ -163,7 +163,7 @@ class BaseNode(Node):
         return float(self.get_clock().handle.get_now().nanoseconds) * 1e-9
 
     def tick_rate(self) -> float:
-        """Return the rate of the ticks that a subclass has counted in ``ticked`` since the last call [Hz]."""
+        """Return the rate of the ticks that a subclass has counted in ``ticked`` since the previous call [Hz]."""
         now = time.monotonic()
         rate = self.ticked / max(now - self._counted_at, 1e-9)
         self.ticked, self._counted_at = 0, now
@@ -284,7 +284,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 def run_node(*makes: Callable[[], BaseNode]) -> int:
     """Run the main function of an executable: make the nodes, spin until Ctrl-C or SIGTERM, and close them.
 
-    Several nodes share the process and its thread, and the end of one of them ends all. A wrong configuration gives one
+    Several nodes share the process and its thread. If one node ends, all nodes end. A wrong configuration gives one
     line on stderr and exit code 2.
 
     Returns:

@@ -51,7 +51,7 @@ class TickExecutor(SingleThreadedExecutor):
         self._ticks: list[Any] = []  # The timers of ticks.
         self._slow_timers: list[Any] = []  # All other timers, except those with a coroutine, which rclpy has to run.
         self._served_at = -math.inf  # Time of the last look at services, slow timers and silent topics [s].
-        self._simulated = False  # See _is_simulated.
+        self._simulated = False  # Whether a tick uses simulated time.
         self._rest = _RestOfNodes([], [])
 
     def add_node(self, node: Any) -> bool:

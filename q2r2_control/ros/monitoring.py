@@ -29,7 +29,7 @@ _NO_WAIT = Duration(nanoseconds=0)
 _CHECK, _GAP = 0.05, 0.015
 _ASKED = 0.02  # Time between two queries whether all messages were acknowledged [s].
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # A command that is older than this is not published [s].
-_LATELY = 32  # Number of sent messages that are remembered. The queue of the node's own subscription is shorter.
+_LATELY = 32  # Number of sent messages that are remembered. It exceeds the queue of the node's own subscription.
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
 _DISCOVERY = 2.0  # Time in which the node of every running arm has reported. Nodes report twice a second [s].

@@ -230,7 +230,7 @@ class TeleopLoop:
             self.teleop.pause(now, reason)
 
     def _watch_time(self) -> None:
-        """Pause the arms if simulated time stands still. The hands still move, and arms must not follow this later."""
+        """Pause the arms if simulated time stands still. No arm may later make up for the hands' motion meanwhile."""
         timeout = self.teleop.settings.gate.timeout
         if (problem := self.nodes[0].clock_problem(timeout)) is None:
             return

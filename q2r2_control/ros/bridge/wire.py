@@ -265,7 +265,7 @@ class TransformNumbers(NamedTuple):
 
 
 class _TransformLayout(NamedTuple):
-    same: tuple[tuple[int, bytes], ...]  # See _JointLayout.
+    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes of the parts that are equal in all messages of this layout.
     frames: tuple[tuple[str, str], ...]  # Child and parent of each transform.
     offsets: tuple[int, ...]  # Offset of the numbers of each transform.
 

@@ -91,7 +91,7 @@ class BaseArmController(BaseNode):
             self.destroy_node()  # A half-made node could keep the process from ending.
             raise
         # For its first log line, rclpy takes some 60 ms, because it searches all modules for the line's origin. This
-        # line is logged now, so that an operator's press does not wait for that.
+        # line is logged now, so that an operator's press does not wait for this search.
         self.get_logger().info(f"the {self.hand} hand moves the target on {self.outputs.first.topic}")
 
     def setup_parameters(self) -> ArmParameters:

@@ -83,7 +83,7 @@ class CartesianControllerNode(ManagedNode):
             self._output.withheld = told.withheld
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
-        # Joint states with numbers that are not finite are a fault at once, because they come from another publisher.
+        # Joint states come from another node. If their numbers are not finite, this is a fault at once.
         watch.unusable_time = 0.0
         make_watching_live(self, streams, watch, external)
         self._watch = watch

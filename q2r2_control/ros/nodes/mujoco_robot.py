@@ -62,8 +62,8 @@ _INVERSE_TIMES = np.array(
 class _Motion:
     handle: ServerGoalHandle
     goal: float  # Opening: 0 closed .. 1 open.
-    seen: float  # Opening at the last motion.
-    moved_at: float  # Time of the last motion [s].
+    seen: float  # Opening when the gripper last moved.
+    moved_at: float  # Time at which the gripper last moved [s].
 
 
 class GripperServer:

@@ -147,7 +147,7 @@ def _arms(view: SetView) -> Iterator[Finding]:
 
 
 def _cure(node: NodeView, line: str) -> str:
-    """Return the cure for the fault that a node reports. The lines of a refusal and of a stop contain the cure."""
+    """Return the cure for the fault that a node reports, or ``line`` if this line already contains the cure."""
     kind = node.values.get("kind")
     if kind in _CURE_IN_SENTENCE or node.values.get("state") == ArmState.STOPPED:
         return line
