@@ -72,7 +72,8 @@ class TorqueSummary:
 
     # For each arm, the time for which its distance from the reference was larger than the impedance's error clip.
     off_reference_s: dict[str, float]
-    min_measured_distance_mm: float | None = None  # For the measured joint positions; None without a monitored pair.
+    # Least distance of a monitored pair at the measured joint positions; None if there is no monitored pair.
+    min_measured_distance_mm: float | None = None
     measured_closest_pair: tuple[str, str] | None = None
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
     max_wall_force_n: float = 0.0  # The greatest force of the wall on one pair.
