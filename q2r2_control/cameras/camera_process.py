@@ -50,7 +50,7 @@ class CameraLost(NamedTuple):
 
 
 class Thinning:
-    """Leaves out pictures, evenly over time, if a camera gives more of them than ``rate`` [Hz]."""
+    """If a camera gives more pictures than ``rate`` [Hz], leaves out some of them, evenly over time."""
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate

@@ -63,7 +63,7 @@ class CameraWatch:
     def __init__(self, name: str, camera: CameraConfig, begin: float) -> None:
         """``begin`` is the time of the run's first tick, by the clock of the pictures [s]."""
         self._name, self._camera = name, camera
-        self._received = begin  # Time of the newest picture's receipt; at first, of the first tick [s].
+        self._received = begin  # Time of receipt of the newest picture; at first, the time of the first tick [s].
         self._missing = MissingPictures(begin, camera.rate)
         self._times: deque[float] = deque()  # Times of the pictures of the last ``_WINDOW`` [s].
         self._told: set[ReasonKind] = set()

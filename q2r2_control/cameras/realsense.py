@@ -83,8 +83,8 @@ class RealSense:
         """Start the streams of a ``pyrealsense2.device``.
 
         Raises:
-            CameraError: If it has no stream of the size that the cell says.
-            RuntimeError: If the library cannot start them.
+            CameraError: If the device has no stream of the size that the cell says.
+            RuntimeError: If the library cannot start the streams.
         """
         import pyrealsense2 as rs
 
