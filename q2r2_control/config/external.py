@@ -94,7 +94,7 @@ class GuardLimits(StrictModel):
     )
 
     def over(self, guard: GuardSettings) -> GuardSettings:
-        """Return a copy of ``guard``, in which each limit that is not None in this instance replaces its limit."""
+        """Return a copy of ``guard`` in which each limit is the limit of this instance, unless that limit is None."""
         return guard.model_copy(update=self.model_dump(exclude_none=True))
 
 
