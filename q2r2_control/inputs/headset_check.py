@@ -68,7 +68,7 @@ class CheckedServer(Protocol):
 
 
 class HandWatch(Protocol):
-    """Watches the poses of both hands, and may warn about them. :class:`CrossedHands` is such a class."""
+    """Watches the poses of both hands, and can warn about them. :class:`CrossedHands` is such a class."""
 
     def add(self, sample: HandSample) -> None: ...
 

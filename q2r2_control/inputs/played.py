@@ -21,7 +21,7 @@ _ROTATION_NOISE = math.radians(0.03)  # Standard deviation of the noise about ea
 
 
 class SampleTiming(ABC):
-    """The times at which the samples of one hand are measured, their noise, and the times at which they are received.
+    """For the samples of one hand: the times of their measurement, their noise, and the times of their receipt.
 
     For each sample, the caller takes the next of the ``times``, then calls ``measured`` once, and ``lateness`` once.
     """

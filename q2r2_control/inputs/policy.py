@@ -40,7 +40,7 @@ _JOINED = 1.0  # Longest time that the end of a run waits for a policy that stil
 class ActionSpace(StrEnum):
     """The kind of numbers in an action. Each value is the name of the dataset feature that has the same numbers.
 
-    The openings of all grippers may follow the numbers.
+    After these numbers, an action may contain the openings of all grippers.
     """
 
     JOINTS = "action"  # Joint positions of all arms [rad].

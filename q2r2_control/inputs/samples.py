@@ -72,7 +72,7 @@ class SampleQueue:
             return samples
 
     def cut(self) -> None:
-        """Note that the connection is lost, and forget the queued samples, which may be old."""
+        """Note that the connection is lost, and forget the queued samples, which can be old."""
         with self._lock:
             self._samples.clear()
             self._takes_owed = 2

@@ -115,7 +115,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
 
 
 def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
-    """Return the motion of hands that do several named works one after the other. At the end they pause the arms."""
+    """Return the motion of hands that do several named works one after the other, and then pause the arms."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
@@ -144,7 +144,10 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
 
 
 def _from_home(points: Sequence[WayPoint], hand: str, precise: Sequence[tuple[float, float]]) -> Path:
-    """Return the motion of ``hand`` that moves its tool through ``points``, with precision in the spans ``precise``."""
+    """Return the motion of ``hand`` that moves its tool through ``points``.
+
+    In the time spans ``precise``, the hand moves its tool with precision.
+    """
     tool, home = WayPoints(points), np.array(HOME[hand])
 
     def displacement(t: float, frequency: float) -> tuple[Array, Array]:
@@ -208,9 +211,10 @@ _NO_PRESS = (0.3, 0.6)  # Hands do not hesitate within these times before and af
 
 
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
-    """Return the same work of hasty hands. They are faster and hesitate, and the headset loses them once for a second.
+    """Return the same work, done by hasty hands.
 
-    After the loss, the hands wait until the headset sees them again, engage both arms again, and go on.
+    Hasty hands are faster and hesitate, and the headset loses them once for a second. After the loss, the hands wait
+    until the headset sees them again, engage both arms again, and go on.
     """
     assert work.duration is not None
     random, presses = np.random.default_rng([seed, len(SIDES)]), [*work.lower_presses, *work.grips]
