@@ -65,7 +65,10 @@ def _orientation(camera: CameraConfig) -> Array:
 
 
 class CellPictures:
-    """Takes pictures with the cameras of a model. One thread must do this, because an OpenGL context belongs to it."""
+    """Takes pictures with the cameras of a model. Only one thread may use an instance.
+
+    The reason is that an OpenGL context belongs to one thread.
+    """
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
         """Prepare pictures of a simulated cell.

@@ -92,9 +92,9 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 
 
 def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
-    """Return the names of all moving bodies without a mass, if no body that is fixed to them has a mass either.
+    """Return the names of all moving bodies that have no mass, and to which no body with a mass is fixed.
 
-    MuJoCo's own error names only one of them.
+    MuJoCo's own error names only one of these bodies.
     """
 
     def mass(body: mujoco.MjsBody) -> float:

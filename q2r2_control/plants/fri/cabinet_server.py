@@ -52,7 +52,7 @@ class Network:
 
     loss: float = 0.0  # Share of lost datagrams in each direction.
     duplicate: float = 0.0  # Share of messages that come twice.
-    jitter: float = 0.0  # Largest random delay of a datagram [s]. Later datagrams may overtake it.
+    jitter: float = 0.0  # Largest random delay of a datagram [s]. Later datagrams can overtake it.
     cut: float = 0.0  # Share of datagrams that lose their end, in each direction.
 
 
@@ -214,7 +214,7 @@ class CabinetServer:
         self._sent_at: dict[str, float] = {}  # Time of the newest message of each arm [s].
 
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
-        """Run until ``until``, called with the time since the start [s], returns True.
+        """Run until ``until`` returns True. The argument of ``until`` is the time since the start [s].
 
         ``tick`` is called after each message of a cabinet, with the time at which this message was due [s].
         """

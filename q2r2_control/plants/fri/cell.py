@@ -106,8 +106,8 @@ class FriCell:
         late, self._now, before = now - self._now if following else 0.0, now, self._end
         longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
         self._longest_tick = max(self._period, min(longest, self._longest))
-        # While no arm follows, a session may have begun, and the loop may not know it yet. Each tick therefore moves
-        # the reference by one period.
+        # Even if no arm follows, a session can have begun already without the loop's knowledge. Each tick therefore
+        # moves the reference by one period.
         ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
@@ -172,7 +172,8 @@ class FriCell:
     def _ahead(self) -> float:
         """The time from a tick to the end of the motion that it adds to the path [s].
 
-        If no tick and no command comes later than the recent ones, every answer is for a time before this end.
+        If no tick and no command is later than the recent ticks and commands, every answer is for a time before this
+        end.
         """
         return self._longest_tick + self._margin - _MARGIN
 

@@ -27,7 +27,7 @@ from q2r2_control.types import Array
 # loop has computed the reference for that time before the question arrives.
 DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
-_RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
+_RESTARTED = 1000  # If a message's counter goes back by more than this, the session has begun again.
 _COUNTERS = 1 << 32
 # A message's counter may have grown by at most twice the number of periods that have passed, plus this number.
 _MOST_AHEAD = 20
@@ -256,7 +256,7 @@ class ArmSession:
         time, state = self._times.at(*question), self.state
         wanted = self._clock.expected - self.waits - DELAY
         if abs(wanted - time) > message.period and self._rests(min(time, wanted)):
-            # The times may begin anew, because an answer may be for any time while nothing moves.
+            # While nothing moves, an answer may be for any time. The times of answers can therefore begin anew.
             self._times.restart()
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
