@@ -44,7 +44,7 @@ class AnsweringProcess:
             PlantError: If the process cannot begin.
         """
         self._robots, self._longest_word = robots, longest_word
-        # States that nobody reads may fill their socket. Commands and replies therefore have another socket.
+        # States that nobody reads can fill their socket. Commands and replies therefore have another socket.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)

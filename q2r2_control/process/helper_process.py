@@ -96,9 +96,9 @@ class HelperProcess:
     def finish(self, patience: float, longest: float = math.inf) -> None:
         """Wait until the process has done all requests and has ended.
 
-        If it neither takes nor answers anything for ``patience`` [s] although processors are free, it is killed. It is
-        also killed if it has not ended after ``longest`` [s]. This method does not wait until a killed process has
-        ended.
+        If the process neither takes nor answers anything for ``patience`` [s] although processors are free, it is
+        killed. It is also killed if it has not ended after ``longest`` [s]. This method does not wait until a killed
+        process has ended.
         """
         self._ending = True
         self._queue.put(None)
@@ -206,7 +206,7 @@ def run_helper(module: str) -> None:
     """
     leave_signals_to_the_run()
     stream, sys.stdout = sys.stdout.buffer, sys.stderr  # The run must not read a library's output as an answer.
-    lock = Lock()  # Answers are sent one after the other, although several threads may send them.
+    lock = Lock()  # Only one answer is sent at a time, although several threads can send answers.
 
     def answer(content: Any) -> None:
         with lock, suppress(BrokenPipeError):  # Writing fails if the run was killed.
