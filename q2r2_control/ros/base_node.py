@@ -58,7 +58,7 @@ SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
 # the next one. A reliable subscription delivers in order: after a lost message, later messages would wait up to 3 s.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# The profile of messages that are only recorded. All of them are needed, but they may arrive late.
+# The profile of messages that are only recorded. All of them are needed, but a late arrival does no harm.
 RECORDED_QOS = QoSProfile(depth=200)
 # The profile of latched messages (transient local), such as robot_description. A node that subscribes later still gets
 # the last message.
@@ -197,7 +197,7 @@ class BaseNode(Node):
         """Close the node. It is called at the end, while the node can still publish."""
 
     def destroy_node(self) -> None:
-        """Destroy the node with its actions. rclpy would not destroy the actions, and the middleware could not end."""
+        """Destroy the node and its actions. rclpy alone would keep the actions, and the middleware could not end."""
         for action in [one for one in self.waitables if isinstance(one, (ActionClient, ActionServer))]:
             action.destroy()
         super().destroy_node()

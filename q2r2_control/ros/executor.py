@@ -109,7 +109,7 @@ class TickExecutor(SingleThreadedExecutor):
         return min([longest, *(1e-9 * one for one in left if one is not None)])
 
     def _is_simulated(self) -> bool:
-        """Return whether a tick uses simulated time. This may change while a node runs."""
+        """Return whether a tick uses simulated time. This can change while a node runs."""
         return any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks)
 
     def _serve(self) -> None:

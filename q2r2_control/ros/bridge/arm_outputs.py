@@ -77,7 +77,7 @@ class ArmOutputs:
         self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now, or None.
         self._relaying = False
         raw = not self._filtered and preset is not BUILTIN
-        # The built-in controller needs no such watch. Its reference may rest on purpose, such as near an obstacle, and
+        # The built-in controller needs no such watch. Its reference can rest on purpose, such as near an obstacle, and
         # is known here from its safe targets.
         self._stands = StandstillWatch(LAGGING_TOOL) if raw else None
         self._node, self._arm = node, arm
@@ -172,7 +172,7 @@ class ArmOutputs:
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
-        # The stream starts at the measured tool, because the safe target may differ from it by the arm's steady-state
+        # The stream starts at the measured tool, because the safe target can differ from it by the arm's steady-state
         # offset.
         self._relay.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)

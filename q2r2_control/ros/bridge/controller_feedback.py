@@ -174,7 +174,7 @@ class GripperLimits:
         }
 
     def awaits(self, now: float) -> bool:
-        """Return whether the last commanded opening of a measured gripper may still arrive over ROS.
+        """Return whether the last commanded opening of a measured gripper can still arrive over ROS.
 
         Without this opening, the fingers count as anywhere between closed and open. Arms that rest near an object would
         then move away from it.

@@ -45,7 +45,7 @@ class ReadTransform:
 
     @property
     def pose(self) -> pin.SE3:
-        """The pose, which is computed at its first use, because most links of an arm are never used."""
+        """The pose. It is computed at its first use, because the poses of most links are never used."""
         if self._pose is None:
             self._pose = pose_of_numbers(self.numbers)
             assert self._pose is not None

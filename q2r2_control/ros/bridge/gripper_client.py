@@ -1,4 +1,4 @@
-"""The client of an arm's gripper, for the kinds of grippers in use."""
+"""The client of an arm's gripper, for each ROS interface of :class:`GripperType`."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ class TargetOutput:
         return twist_stamped(base.rotation.T @ linear, base.rotation.T @ angular, self._frame, now)
 
     def _end_stream(self, state: ArmState, now: float) -> None:
-        """If the operator paused the arm, publish the end of the stream. If it stops otherwise, publish nothing."""
+        """Publish the end of the stream if the operator paused the arm, but not if the arm stops for another reason."""
         if self._ends is None or state is not ArmState.PAUSED:
             self._sent_at = -math.inf
         elif _END_DELAY < now - self._sent_at < math.inf:
@@ -187,7 +187,7 @@ class TargetOutput:
         self.guard.reset(None, now)
 
     def _present(self) -> int:
-        """Return the number of subscribers. The graph may list some before the publisher can send to them."""
+        """Return the number of subscribers. The graph can list a subscriber before the publisher can send to it."""
         return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:

@@ -193,8 +193,8 @@ class TeleopLoop:
             for node in nodes:
                 node.feedback.haptics.start_pulse(Event(now, node.arm_name, node.state, node.state, reason))
         faults = {node.arm_name: node.begin_tick(now) for node in nodes}
-        # The time is read after the nodes were judged, because the process may have been frozen in the middle of this
-        # tick. A gap in the node's own ticks is checked first, because it makes other nodes look silent.
+        # The time is read again here, because the process may have been frozen since the start of this tick. A gap
+        # between ticks of this process is handled before the faults, because such a gap makes other nodes look silent.
         gap, self._ticked = nodes[0].now - self._ticked, now
         if gap > teleop.settings.gate.timeout:
             self._pause(now, Reason.of(RosReason.NODE_STALLED, duration=gap))

@@ -101,7 +101,7 @@ class _Walk:
 
     def __init__(self, data: bytes) -> None:
         self.data, self.offset = data, 4  # Alignment is relative to the end of the encapsulation, which has 4 bytes.
-        # Offsets and bytes of texts and lengths. The gaps between aligned parts may have any bytes.
+        # Offsets and bytes of texts and lengths. The gaps between aligned parts can contain any bytes.
         self.same = [(1, _LITTLE_ENDIAN)]
         if data[1:2] != _LITTLE_ENDIAN:
             raise SerdeError("not little endian, as every platform of this ROS is")

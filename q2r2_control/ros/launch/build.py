@@ -45,7 +45,7 @@ class Interfaces:
 
     def found_in(self) -> Path | None:
         """Return the folder from which a new Python process imports all types, or None."""
-        # The path is the same as if this environment's setup file is sourced after a ROS's setup file.
+        # Libraries are found as if the setup file of this environment was sourced after the setup file of a ROS.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
         command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
         environment = os.environ | {"LD_LIBRARY_PATH": libraries}

@@ -208,7 +208,7 @@ class MujocoRobot(BaseNode):
         self._tf_static.publish(fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
-        # The queue has two messages per arm. Each arm may have its own sender, and one sender's message must not
+        # The queue has two messages per arm. Each arm can have its own sender, and one sender's message must not
         # replace the other sender's message.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
         names, move, push = self._robot.joint_names, self._cell.command_velocities, self._cell.command_torques
@@ -238,7 +238,7 @@ class MujocoRobot(BaseNode):
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
         # Delays are watched separately for each topic and each first joint, because two controllers, each for one arm,
-        # may send on the same topic from hosts with different clocks.
+        # can send on the same topic from hosts with different clocks.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):

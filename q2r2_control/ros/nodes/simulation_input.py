@@ -119,7 +119,7 @@ class SimulationInput(BaseNode):
         if now <= self._until:
             self._listeners.look()  # Later, the arms are known, and the graph need not be asked any more.
         t = now - self._began
-        # The last event of an arm may be a request before the first press. Such a request does not count.
+        # The last event of an arm can be a request before the first press. Such a request does not count.
         self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
         all_follow = len(following) == len(self._hands)
         recovers = all_follow or (now - self._followed <= _RECOVERS and bool(self._listeners.lost()))
