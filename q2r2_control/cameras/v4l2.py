@@ -60,7 +60,7 @@ def capture_devices() -> dict[str, str]:
 def fault_of(path: str) -> str | None:
     """Return why a device cannot be opened as a camera; None if it can be.
 
-    While another program reads the device, this function may return None although the device gives no pictures.
+    While another program reads the device, this function can return None although the device gives no pictures.
     """
     try:
         file = os.open(path, os.O_RDWR | os.O_NONBLOCK)
