@@ -47,7 +47,7 @@ class Preset:
     guard: GuardSettings = _CAREFUL
     # The kind of joint commands that the node cartesian_controller sends in mode filtered; "none" if it sends none.
     output: str = "none"
-    # Topic for a message with a zero wrench, without which the controller may push; None if it needs no such message.
+    # Topic for a message with a zero wrench, without which the controller can push; None if it needs no such message.
     zero_wrench: str | None = None
     # Service that is called at each start to set the type of targets; None if the controller needs no such call.
     command_type: str | None = None

@@ -156,7 +156,7 @@ REALSENSE = "realsense:"  # The beginning of ``device`` for a RealSense camera. 
 class CameraConfig(StrictModel):
     """A camera of the simulated cell, a real camera on a ROS topic, or a device that this computer opens.
 
-    The simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
+    A simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
     up in the picture.
     """
 

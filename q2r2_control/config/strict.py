@@ -170,7 +170,7 @@ Network = IPv4Network | IPv6Network
 
 
 def network_of(text: str) -> Network:
-    """Return the network ``text``, such as ``192.168.1.0/24`` or ``fd00::/64``. One address is a network of one host.
+    """Return the network ``text``, such as ``192.168.1.0/24`` or ``fd00::/64``. An address is a network of one host.
 
     Raises:
         ValueError: If the text is not a network. The message names the text and what is allowed.
