@@ -171,7 +171,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """Return a random shift of all tasks' parts along x and y [m]. Both are between -``spread`` and ``spread``."""
+    """Return a random shift of all tasks' parts along x and y [m], each between -``spread`` and ``spread``."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
@@ -265,7 +265,7 @@ HANDS_AT_REST = {
 _DROPOUT_PROBABILITY = 0.005  # Probability that a sample is lost.
 _DIFFERENCE = 1e-4  # Half the time step of a central difference of the ideal pose [s].
 DEFAULT_TRAJECTORY = "meet"
-# Length of an iiwa 7 from its first joint to its last. The motions are written for an arm of this length [m].
+# Length of an iiwa 7 from its first joint to its last joint. The motions are written for an arm of this length [m].
 _FULL_LENGTH = 1.12
 
 

@@ -16,7 +16,7 @@ from q2r2_control.inputs.webxr.page_messages import PageMessage
 from q2r2_control.inputs.webxr.shown import FromRun, ShownVibration
 from q2r2_control.types import HapticFeedback
 
-MAX_MESSAGES_PER_SECOND = 300  # A page that sends more messages is dropped. Headsets send up to 120.
+MAX_MESSAGES_PER_SECOND = 300  # A page that sends more messages is dropped. Headsets send up to 120 per second.
 
 _LONGEST_REASON = 120  # Greatest length of the reason for which a socket is closed [bytes].
 
