@@ -35,7 +35,8 @@ def open_cameras(model: bytes, cameras: Mapping[str, CameraConfig]) -> CellPictu
 
 
 def jpeg_of(picture: Array | np.ndarray, quality: int) -> bytes:
-    from PIL import Image  # The import is here, because runs without pictures import this module, too.
+    # Pillow is imported here, because runs without pictures, which do not need Pillow, import this module too.
+    from PIL import Image
 
     packed = io.BytesIO()
     Image.fromarray(picture).save(packed, "JPEG", quality=quality)

@@ -24,7 +24,9 @@ with importing("sim", "the simulation in MuJoCo"):
 # Rotation from the axes of a MuJoCo camera to the axes of our cameras. A MuJoCo camera looks along -z, and y points up
 # in the picture. Our cameras look along x, and z points up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_STRAIGHT = 1e-9  # With a smaller sine of the angle to the vertical, the camera looks straight up or down.
+# If the sine of the angle between the line of sight and the vertical is smaller than this, the camera counts as looking
+# straight up or down.
+_STRAIGHT = 1e-9
 _LONGEST_CLOSE = 5.0  # Longest time to wait until a window is closed [s].
 _OPACITY = 0.6  # Opacity of moving obstacles.
 # Size of the shadow map [pixels], number of samples per pixel, and numbers of slices and stacks of round shapes. Larger

@@ -17,7 +17,7 @@ def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     """Add sky, lights and a plane for the floor, and set the view of a window.
 
     ``floor`` is True if the cell has a floor, whose boxes the plane replaces. Otherwise, the plane is only drawn, at
-    z = 0. It then causes no contacts, because the arms may move below it.
+    z = 0. It then causes no contacts, because the arms are allowed to move below it.
     """
     spec.add_texture(
         name="sky",

@@ -6,8 +6,8 @@ velocity. If an answer were for the time at which its question arrived, the jitt
 The times of answers are therefore evenly spaced: each one is one period after the time of the newest answer that the
 cabinet has heard.
 
-**Catching up.** Lost messages and drift let the times of answers fall behind the questions. They catch up at a rate of
-1 + ``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the
+**Catching up.** Lost messages and drift let the times of answers fall behind the questions. These times catch up at a
+rate of 1 + ``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the
 velocity v and the acceleration a, the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration (1 +
 CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
@@ -30,7 +30,7 @@ from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # The rate at which the times of answers pass differs from 1 by at most this number.
 CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
-# If a cabinet's clock is slower than it was assumed, ``MessageClock`` adapts to it within this number of messages.
+# If a cabinet's clock is slower than assumed, ``MessageClock`` adapts to this clock within this number of messages.
 _SETTLED = 500
 _PIECES = 1024  # Number of pieces of the path that are kept. A piece is the motion of one tick, or a stop.
 # Number of answers whose time is remembered. At the shortest period of 1 ms, these answers span four times the lag

@@ -185,7 +185,7 @@ class FriCell:
         """Return the time from the end of a command until a tick measures the arm at the command's posture [s].
 
         A cabinet begins to move the arm to this posture with its next message, and takes one period for this motion.
-        The newest message is half a period old on average. With torques the result is 0, because they act at once.
+        The newest message is half a period old on average. With torques the result is 0, because torques act at once.
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)

@@ -302,7 +302,7 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: float) -> bytes | None:
     """Answer a cabinet's message as :meth:`ArmSession.answer` does, and let its arm wait for arms that are behind.
 
-    The wait is half the largest lag of the other arms. They catch up meanwhile, until no arm is behind.
+    The wait is half the largest lag of the other arms. The other arms catch up meanwhile, until no arm is behind.
     """
     lags = [other.state.timing(now).lag for name, other in sessions.items() if name != arm and other.state.following]
     sessions[arm].waits = 0.5 * max(0.0, *lags, 0.0)
