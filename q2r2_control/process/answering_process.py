@@ -52,7 +52,7 @@ class AnsweringProcess:
         with commands, states:
             self._process = start_python(f"from {module} import main; main{links}", {}, files=[*links, *files])
         self.pid = self._process.pid
-        # If the loop has a real-time priority, the process gets a higher one. Otherwise, the number that it gets is 0.
+        # If the loop has a real-time priority, the process gets a higher priority. Otherwise, it gets the number 0.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, *given)))
         word = b""

@@ -65,7 +65,7 @@ HERE = ThisProcess()
 
 @dataclass(frozen=True)
 class Processes:
-    """Runs jobs in at most ``most`` processes of this computer. If the caller stops early, they are killed."""
+    """Runs jobs in at most ``most`` processes of this computer. If the caller stops early, the processes are killed."""
 
     most: int
     where = ""

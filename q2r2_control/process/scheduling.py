@@ -49,7 +49,7 @@ def real_time(priority: int = _PRIORITY) -> Iterator[str | None]:
 
 
 def reserve(runtime: float, period: float) -> bool:
-    """Reserve ``runtime`` [s] of a processor in every ``period`` [s] for the calling thread, before all others.
+    """Reserve ``runtime`` [s] of a processor in every ``period`` [s] for the calling thread, before all other threads.
 
     If threads under SCHED_FIFO leave no time for other programs, Linux halts them for up to 50 ms. A reservation
     (SCHED_DEADLINE) has precedence over this halt. A thread that needs more time waits for its next period.
