@@ -347,7 +347,7 @@ def end_in_time() -> None:
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
-    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done earlier, without it."""
+    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done before that."""
     priority = max(node.priority for node in nodes)
     if not priority:
         return

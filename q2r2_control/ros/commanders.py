@@ -1,7 +1,7 @@
 """Find other publishers of topics that may have one publisher only: hands, targets and commands.
 
-A publisher that appears is found in the graph within 0.04 s after the middleware has discovered it. A publisher that
-was there before and was silent is found by its first message.
+A publisher that appears is found in the graph within 0.04 s after the middleware has discovered it. An older
+publisher that was silent is found by its first message.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ class TickExecutor(SingleThreadedExecutor):
         super().__init__(context=context)
         self._changed = True  # Whether timers, subscriptions or the like were made or destroyed.
         self._subscriptions: list[Any] = []  # Subscriptions, each with the number of arguments of its callback.
-        self._streams: list[Any] = []  # The subscriptions that have a publisher. Others need not be looked at.
+        self._streams: list[Any] = []  # The subscriptions that have a publisher. Other subscriptions need no check.
         self._ticks: list[Any] = []  # The timers of ticks.
         self._slow_timers: list[Any] = []  # All other timers, except those with a coroutine, which rclpy has to run.
         self._served_at = -math.inf  # Time of the last look at services, slow timers and silent topics [s].

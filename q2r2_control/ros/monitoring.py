@@ -43,7 +43,7 @@ _known: dict[bytes, str] = {}
 
 
 def node_of(endpoint: Any) -> str | None:
-    """Return the full name of the node to which an endpoint belongs; None if it was never known."""
+    """Return the full name of the node to which an endpoint belongs; None if this name was never known."""
     number = bytes(endpoint.endpoint_gid)
     if not endpoint.node_name.startswith("_NODE_NAME_"):  # rcl gives such a name if it does not know the node.
         _known[number] = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"

@@ -189,7 +189,7 @@ class ToolFrame:
         self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
-        """Return the newest pose at ``now`` [s], or None if it is not known. Then ``problem`` says why."""
+        """Return the newest pose at ``now`` [s]. If it is not known, return None, and ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
         if placement is not None:
             self.received = placement.received

@@ -30,7 +30,7 @@ class OpeningGrants:
     """Requests openings of one arm's gripper from the built-in controller: 0 closed .. 1 fully open.
 
     It publishes the wanted opening and the last commanded opening. From these, a restarted controller knows where the
-    gripper may be, and does not take an old request for a new one.
+    gripper can be, and does not take an old request for a new one.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, target_topic: str) -> None:

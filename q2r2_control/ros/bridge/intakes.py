@@ -308,8 +308,8 @@ class JointIntake:
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
         """Return the sender's own names of an arm's joints; [] if they cannot be found. They are logged once."""
         names = self._names[topic]
-        # Any robot can publish on the default topic. If messages with our names came on a topic, other names on it are
-        # not needed.
+        # Any robot can publish on the default topic. If messages with our names came on a topic, other names on this
+        # topic are not needed.
         if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:
             return []
         theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])

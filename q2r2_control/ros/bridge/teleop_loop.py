@@ -150,7 +150,7 @@ class TickInputs(NamedTuple):
 
     tool: pin.SE3 | None  # The measured tool pose.
     commanded: pin.SE3 | None  # The tool pose in the controller's reference, or the best substitute that is known.
-    reference: int | None  # Stamp of that reference by the controller's clock [ns]; None if there is none.
+    reference: int | None  # Stamp of the controller's reference by the controller's clock [ns]; None if there is none.
     obstacle: Reason | None  # Why the arm may not be engaged.
 
 
@@ -162,7 +162,11 @@ class TeleopLoop:
         self.teleop: Teleop
 
     def join(self, node: BaseArmController) -> None:
-        """Teleoperate this node's arm as well, before the first tick; raises :class:`ConfigError` if nodes differ."""
+        """Teleoperate this node's arm as well, from the first tick on.
+
+        Raises:
+            ConfigError: If the settings of this node differ from the settings of the first node.
+        """
         ours, first = node.parameters, (self.nodes or [node])[0]
         theirs = first.parameters
         for name in ("teleop", "rate", "mode", "builtin_node"):

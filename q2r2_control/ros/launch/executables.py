@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 # For each executable: the name of a module of ``nodes``, and the name of a class or function in this module. The class
-# is that of a node. The function runs several nodes.
+# is the class of a node. The function runs several nodes.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
     "SimulationInput": ("simulation_input", "SimulationInput"),

@@ -130,7 +130,7 @@ class CartesianControllerNode(ManagedNode):
     def _standstill(self, output: str) -> StandstillLimits | None:
         """Return the limits above which a driver counts as standing still; None for compliant arms.
 
-        A person may prevent the motion of a compliant arm.
+        A person can prevent the motion of a compliant arm.
         """
         if output == NONE:
             return LAGGING_JOINTS

@@ -44,7 +44,7 @@ _TRAJECTORY = "joint_trajectory"
 _REACHED = 0.02  # Distance from the goal that counts as reached, as a share of the stroke.
 _STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time has stalled [s].
 _MOVES = 0.004  # Least motion of a gripper that counts, as a share of the stroke.
-_OUTSIDE = 0.02  # A goal that exceeds the stroke by this share of it still counts as the stroke's end.
+_OUTSIDE = 0.02  # A goal that exceeds the stroke by at most this share of the stroke counts as the end of the stroke.
 _CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
 # The parts x y z w of the product of two unit quaternions, the first of which is inverted. Each part is a sum over the
 # products of the parts w x y z of both, with these factors.

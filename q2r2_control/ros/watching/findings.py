@@ -221,7 +221,10 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
 
 
 def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, Any] | Finding:
-    """Start a node in another process, which tries ``packages``; return its answer, or why there is no node."""
+    """Start a node in another process, which also tries all ``packages``.
+
+    Return the answer of this process, or a finding that says why it could start no node.
+    """
     own = dict(environment)
     set_up_middleware(own)
     try:
