@@ -135,7 +135,7 @@ class SessionPlant(Protocol):
         """Return the time from the moment when a command is due until the arms are measured at its posture [s]."""
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return how the motion of each arm is timed relative to the reference; empty if all timings are equal."""
+        """Return how the motion of each arm is timed relative to the reference; empty if all are timed alike."""
 
     def lead(self) -> float:
         """Return the longest time from the newest posture that was sent to an arm to the end of the newest step [s].
