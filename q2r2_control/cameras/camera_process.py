@@ -23,7 +23,7 @@ from q2r2_control.errors import CameraError
 _NICENESS = 15
 _QUALITY = 90  # The quality of JPEG pictures, from 0 to 100.
 _RETRY = 0.5  # Time between two attempts to open a camera that was lost [s].
-_EARLY = 0.4  # A picture is kept if it comes before it is due, but by at most this share of a period.
+_EARLY = 0.4  # A picture that comes before it is due is kept if it is early by at most this share of a period.
 
 
 class CameraShot(NamedTuple):
@@ -50,7 +50,7 @@ class CameraLost(NamedTuple):
 
 
 class Thinning:
-    """Leaves out pictures, evenly over time, if a camera gives more of them than ``rate`` [Hz]."""
+    """If a camera gives more pictures than ``rate`` [Hz], leaves out some of them, evenly over time."""
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate
@@ -90,7 +90,7 @@ def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
             answer(CameraLost(str(error)))
         device.close()
         if camera.device_kind == "file":
-            # This process then only waits, because a video that has ended does not begin again.
+            # A video that has ended does not begin again, so this process only waits until the run ends.
             threading.Event().wait()
         device = _opened_anew(camera)
 

@@ -16,7 +16,7 @@ from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
 _WAITING = 256  # Greatest number of a camera's pictures that wait for ``take``. If more come, the oldest are lost.
-_READY = 120.0  # Longest wait for a camera's first picture [s]. A busy computer may need so long.
+_READY = 120.0  # Longest wait for a camera's first picture [s]. A busy computer starts a camera's process slowly.
 _Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks whether a picture has come [s].
 
@@ -50,11 +50,11 @@ class CameraStream:
         self._hearers.append(hearer)
 
     def take(self) -> list[tuple[float, CameraShot]]:
-        """Return the pictures since the last call, each with the time of its receipt [s]. This method never waits."""
+        """Return the pictures since the previous call, each with its time of receipt [s]. This method never waits."""
         return _taken(self._waiting)
 
     def take_depths(self) -> list[DepthShot]:
-        """Return the depth pictures since the last call. This method never waits."""
+        """Return the depth pictures since the previous call. This method never waits."""
         return _taken(self._depths)
 
     def first_picture(self) -> CameraShot:

@@ -12,13 +12,14 @@ from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.events import Reason, ReasonKind
 
-# A camera has stopped if no picture came for the longer of these two times: a number of its periods, and a time [s].
+# A camera has stopped if no picture has come for at least this number of its periods and for at least this time [s].
 _STOPPED_PERIODS, _STOPPED_AFTER = 5.0, 1.0
 _WINDOW = 2.0  # Time over which the rate of a camera is measured [s].
 # The delays of successive pictures are added up. If the sum is at least 1 - _NEARLY periods, a picture counts as
 # missing. Only the share _REMEMBERS of the sum still counts at the next picture.
 _NEARLY, _REMEMBERS = 0.3, 0.9
-# Shares of the rate. Below the first share, a camera counts as slow. From the second share on, it no longer does.
+# If the measured rate is below the first share of the camera's rate, the camera counts as slow. It then counts as slow
+# until the measured rate reaches the second share.
 _SLOW, _FAST_ENOUGH = 0.8, 0.9
 
 
@@ -31,7 +32,7 @@ class MissingPictures:
     """Counts the pictures of a camera that are missing, from the times of the pictures that came.
 
     Pictures of a real camera come unevenly, and not at exactly its rate. Therefore the delays of successive pictures
-    are added up, and small delays are forgotten within some ten pictures. A picture counts as missing if the sum is
+    are added up, and small delays are forgotten within about ten pictures. A picture counts as missing if the sum is
     nearly a period.
     """
 
@@ -62,7 +63,7 @@ class CameraWatch:
     def __init__(self, name: str, camera: CameraConfig, begin: float) -> None:
         """``begin`` is the time of the run's first tick, by the clock of the pictures [s]."""
         self._name, self._camera = name, camera
-        self._received = begin  # Time of the newest picture's receipt; at first, of the first tick [s].
+        self._received = begin  # Time of receipt of the newest picture; at first, the time of the first tick [s].
         self._missing = MissingPictures(begin, camera.rate)
         self._times: deque[float] = deque()  # Times of the pictures of the last ``_WINDOW`` [s].
         self._told: set[ReasonKind] = set()
@@ -113,12 +114,12 @@ class CameraWatch:
         rate = (len(self._times) - 1) / span
         self._times.popleft()
         share = rate / self._camera.rate
-        if _SLOW <= share < _FAST_ENOUGH:  # Between the shares, the last report stays valid.
+        if _SLOW <= share < _FAST_ENOUGH:  # Between the two shares, a slow camera still counts as slow.
             return []
         return self._tell(CameraReason.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
 
     def _tell(self, kind: ReasonKind, is_so: bool, **detail: Any) -> list[Reason]:
-        """Return a reason of this ``kind`` if the fault is present (``is_so``) and was absent at the last call."""
+        """Return a reason of this ``kind`` if the fault is present (``is_so``) and was absent at the previous call."""
         was_told = kind in self._told
         (self._told.add if is_so else self._told.discard)(kind)
         return [self._reason(kind, **detail)] if is_so and not was_told else []

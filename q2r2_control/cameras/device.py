@@ -77,7 +77,7 @@ def capture_time(received: float, stamp_ms: float, delay: float) -> float:
         received: Time of its receipt [s].
         stamp_ms: Stamp of the driver [ms]. V4L2 drivers use the monotonic clock. Other drivers give 0, or the time
             since their stream began.
-        delay: Time from the capture to the receipt [s]. It is used if the stamp is not by the monotonic clock.
+        delay: Time from the capture to the receipt [s]. It is used if the stamp does not come from the monotonic clock.
     """
     stamp = stamp_ms / 1e3
     return stamp if 0.0 <= received - stamp < _OLDEST_STAMP else received - delay

@@ -28,9 +28,11 @@ class LoopTimes:
         self._ticks.append(tick)
 
     def at(self, computer: float) -> TickTime:
-        """Return the loop's time at a time of the computer's clock, with the number of the last tick up to then.
+        """Return the loop's time at the time ``computer`` of the computer's clock, and the number of the last tick.
 
-        Before the first tick, the loop's clock is assumed to run like the computer's. The number is then the
+        The last tick is the newest tick that began at ``computer`` or earlier.
+
+        Before the first tick, the loop's clock is assumed to run like the computer's clock. The number is then the
         number of the first tick.
         """
         ahead = None

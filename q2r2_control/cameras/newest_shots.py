@@ -27,7 +27,7 @@ class ReadPicture:
 
     @cached_property
     def pixels(self) -> npt.NDArray[np.uint8]:
-        from PIL import Image  # The import is here, because a policy may use no pixels.
+        from PIL import Image  # Pillow is imported only when a policy uses pixels.
 
         return np.array(Image.open(io.BytesIO(self.jpeg)).convert("RGB"))
 

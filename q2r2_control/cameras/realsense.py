@@ -83,8 +83,8 @@ class RealSense:
         """Start the streams of a ``pyrealsense2.device``.
 
         Raises:
-            CameraError: If it has no stream of the size that the cell says.
-            RuntimeError: If the library cannot start them.
+            CameraError: If the device has no stream of the size that the cell says.
+            RuntimeError: If the library cannot start the streams.
         """
         import pyrealsense2 as rs
 
@@ -114,7 +114,8 @@ class RealSense:
         if frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock:
             stamp_ms = frame.get_timestamp() + 1e3 * _monotonic_minus_unix_time()
         captured = capture_time(received, stamp_ms, self._camera.delay)
-        pixels = turned(np.array(frame.get_data()), self._camera)  # A copy, because the library reuses its memory.
+        # The pixels are copied, because the library reuses the memory of its frames.
+        pixels = turned(np.array(frame.get_data()), self._camera)
         if frame.is_depth_frame():
             return DepthCapture(captured, pixels, frame.as_depth_frame().get_units())
         return Capture(captured, pixels)
@@ -146,7 +147,7 @@ class RealSense:
 def _monotonic_minus_unix_time() -> float:
     """Return the monotonic time minus the Unix time [s].
 
-    The clocks are read one after the other. The readings between which the least time has passed are used.
+    The clocks are read one after the other, three times. The readings that were made in the shortest time are used.
     """
     found = []
     for _ in range(3):

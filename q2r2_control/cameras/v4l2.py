@@ -19,7 +19,8 @@ _ENUM_FMT, _FORMAT = 0xC0405602, struct.Struct("=3I32sI16x")
 _ENUM_FRAMESIZES, _SIZE = 0xC02C564A, struct.Struct("=3I2I24x")
 _ENUM_FRAMEINTERVALS, _INTERVAL = 0xC034564B, struct.Struct("=5I2I24x")
 _CAPTURES, _HAS_DEVICE_CAPS = 0x1, 0x80000000  # Bits of a device's capabilities.
-_VIDEO_CAPTURE, _DISCRETE = 1, 1  # A type of buffers, and a type of frame sizes and frame intervals.
+# The type of buffers for pictures, and the type of frame sizes and intervals that are listed one by one.
+_VIDEO_CAPTURE, _DISCRETE = 1, 1
 _MOST = 200  # Greatest number of entries that are read from a list of the driver.
 _NO_PICTURES = "no camera: it gives no pictures"
 
@@ -59,7 +60,7 @@ def capture_devices() -> dict[str, str]:
 def fault_of(path: str) -> str | None:
     """Return why a device cannot be opened as a camera; None if it can be.
 
-    While another program reads the device, this function may return None although the device gives no pictures.
+    While another program reads the device, this function can return None although the device gives no pictures.
     """
     try:
         file = os.open(path, os.O_RDWR | os.O_NONBLOCK)
@@ -124,6 +125,6 @@ def _answers(
     for index in range(_MOST):
         try:
             answer = ioctl(file, request, form.pack(*asked(index)))
-        except OSError:  # The list has no more entries.
+        except OSError:  # The request fails if the list has no more entries.
             return
         yield form.unpack(answer)

@@ -26,7 +26,7 @@ _USUAL_RADIUS = 0.03  # Default radius of a held object: more than half the open
 
 
 def _beside_the_file(value: str, info: ValidationInfo) -> str:
-    """Return the path of this name in the folder of the YAML, if it exists there; otherwise the name itself."""
+    """Return the path of the file ``value`` in the folder of the YAML; if there is no such file, return ``value``."""
     folder: Path | None = (info.context or {}).get("folder")
     # If a model has no file ending, it is the name of a file robots/NAME.urdf.
     path = f"robots/{value}.urdf" if info.field_name == "model" and not Path(value).suffix else value

@@ -35,7 +35,8 @@ from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSetting
 from q2r2_control.config.strict import Network, StrictModel, network_of
 from q2r2_control.config.teleop import TeleopSettings
 
-AUTO: Literal["auto"] = "auto"  # The loop's rate is chosen when a run in real time begins.
+# With this value of ``loop_rate_hz``, the loop's rate is chosen when a run in real time begins.
+AUTO: Literal["auto"] = "auto"
 HIGHEST_FITTING_RATE_HZ = 1000.0
 
 
@@ -234,7 +235,10 @@ class Config(StrictModel):
 
     @property
     def gripper_delay(self) -> float:
-        """The longest time until a gripper has got its command and its opening is measured, plus a few ticks [s]."""
+        """Time within which a gripper on Modbus gets its newest command and is measured, plus a few ticks [s].
+
+        It is 0 if no gripper is on Modbus.
+        """
         by_modbus = any(isinstance(cabinet.gripper, ModbusGripperConfig) for cabinet in self.fri.values())
         return MODBUS_DELAY if by_modbus else 0.0
 

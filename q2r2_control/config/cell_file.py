@@ -70,8 +70,8 @@ def parse_config(
         return f"{path}: " if number is None else f"{path}, line {number}: "
 
     try:
-        # The check is strict, because `off` would otherwise count as 0.0. The data pass through JSON, so that lists
-        # may become tuples, and names may become enums, in spite of the strict check.
+        # The check is strict, because `off` would otherwise count as 0.0. The data are checked as JSON, because even a
+        # strict check of JSON accepts a list for a tuple, and a name for an enum.
         content = json.dumps(data, default=str)
         config = Config.__pydantic_validator__.validate_json(content, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
@@ -95,8 +95,8 @@ _DRIVER_MARGIN = 0.105
 # constant, and h is the time between commands. For h = 5 ms and T = 40 ms, the share h / T is an eighth. If a command
 # is late by d, the share grows by (d / T)^2 / 2.
 _DRIVER_SPEED = 0.85
-# The same share for a cabinet. While the times of answers catch up with a cabinet's clock, the cabinet sees up to 1.05
-# times the reference's speeds (plants.fri.answers).
+# Greatest share of a joint's velocity limit that the commands for a cabinet may reach. While the times of answers catch
+# up with a cabinet's clock, the cabinet sees up to 1.05 times the reference's speeds (plants.fri.answers).
 _CABINET_SPEED = 0.95
 
 
@@ -122,7 +122,8 @@ def _line_number(text: str, location: Sequence[int | str]) -> int | None:
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):
-            # Two kinds of parts are not in the file: pydantic's tags of alternative models, and missing keys.
+            # Two kinds of parts of ``location`` are not in the file: pydantic's tags of alternative models, and missing
+            # keys. They change neither ``node`` nor ``line``.
             found = [(key, value) for key, value in node.value if key.value == str(part)]
         elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
             found = [(node.value[part], node.value[part])]
@@ -143,7 +144,7 @@ class _Loader(SafeLoader):
         seen: set[Any] = set()
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
-                continue  # With `<<: *other`, keys of the mapping itself may replace the merged ones.
+                continue  # With `<<: *other`, keys of the mapping itself are allowed to replace merged keys.
             key = self.construct_object(key_node, deep=True)
             if key in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)

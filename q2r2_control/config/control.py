@@ -296,7 +296,7 @@ class AdmittanceSettings(StrictModel):
     )
     mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
     inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
-    # The mass in the tool's model may be wrong by 0.2 kg. The default force is the weight of this mass. The default
+    # The mass in the tool's model can be wrong by 0.2 kg. The default force is the weight of this mass. The default
     # torque is the torque of this weight at a distance of 0.15 m from the tool frame.
     force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
     torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")

@@ -94,7 +94,7 @@ class GuardLimits(StrictModel):
     )
 
     def over(self, guard: GuardSettings) -> GuardSettings:
-        """Return ``guard`` with its limits replaced by those limits that are not None here."""
+        """Return a copy of ``guard`` in which each limit is the limit of this instance, unless that limit is None."""
         return guard.model_copy(update=self.model_dump(exclude_none=True))
 
 

@@ -29,7 +29,7 @@ class MovingObstacle(ObstacleConfig):
 
     @property
     def slower(self) -> float:
-        """The greatest speed of its points minus their present speed [m/s].
+        """The greatest speed of the obstacle's points, ``speed``, minus their present speed, ``speed_now`` [m/s].
 
         It is 0 if ``acceleration`` or ``speed_now`` is None.
         """
@@ -37,7 +37,7 @@ class MovingObstacle(ObstacleConfig):
 
     @property
     def rise(self) -> float:
-        """The shortest time in which its points can reach their greatest speed [s]. It is always above 0."""
+        """The shortest time in which the obstacle's points can reach ``speed`` [s]. It is always above 0."""
         return max(self.slower / (self.acceleration or 1.0), 1e-9)
 
     @model_validator(mode="after")
@@ -51,7 +51,7 @@ class ObstacleReport(NamedTuple):
     """The last report of an obstacle."""
 
     obstacle: MovingObstacle
-    age: float  # The age of its pose now [s].
+    age: float  # The age of the obstacle's pose now [s].
 
 
 def check_obstacle(name: str, obstacle: MovingObstacle | None, names: Collection[str]) -> None:

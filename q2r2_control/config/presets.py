@@ -39,17 +39,18 @@ class Preset:
 
     name: str
     activation: str  # The conditions under which the controller follows a target, in words.
-    topic: str = "{ctrl}/target_frame"  # Topic of its target.
-    message: str = POSE  # Message type of its target.
+    topic: str = "{ctrl}/target_frame"  # Topic of the controller's target.
+    message: str = POSE  # Message type of the controller's target.
     rate: float = 100.0  # Rate at which targets are sent [Hz].
     lowest_rate: float = 50.0  # Below this rate of targets, the arm stops or moves unevenly [Hz].
     hold: Hold = Hold.REPEAT
     guard: GuardSettings = _CAREFUL
     # The kind of joint commands that the node cartesian_controller sends in mode filtered; "none" if it sends none.
     output: str = "none"
-    # Topic for a message with a zero wrench, without which the controller may push; None if it needs no such message.
+    # Topic for a message with a zero wrench, without which the controller can push; None if it needs no such message.
     zero_wrench: str | None = None
-    command_type: str | None = None  # Service that is called at each start to set the type of targets; None if none.
+    # Service that is called at each start to set the type of targets; None if the controller needs no such call.
+    command_type: str | None = None
 
     @property
     def takes_targets(self) -> bool:
@@ -66,7 +67,7 @@ BUILTIN = Preset("builtin", "always on", rate=100.0, lowest_rate=20.0, hold=Hold
 _ALL = (
     BUILTIN,
     # The velocity limit of this controller uses the time since the target last changed. After a long pause without
-    # messages, the next target would therefore not be limited. The preset therefore repeats targets during a pause.
+    # messages, this limit would have no effect on the next target. The preset therefore repeats targets during a pause.
     Preset("kuka_lbr_clik", _LATCHES),
     Preset("kuka_lbr_impedance", _LATCHES, rate=200.0, lowest_rate=100.0, zero_wrench="{ctrl}/target_wrench"),
     Preset("fzi", "targets count when they come after its activation"),
@@ -87,8 +88,8 @@ _ALL = (
         hold=Hold.SILENCE,
         command_type="{ctrl}/switch_command_type",
     ),
-    # The next two presets send the target's velocity and not its pose, so that the tool may drift from the target.
-    # While the arm is paused, they send zero velocity.
+    # The next two presets send the target's velocity instead of its pose. The tool can therefore drift away from the
+    # target. While the arm is paused, these presets send zero velocity.
     Preset("twist", "it stops the arm by itself when no velocity comes", topic="{ctrl}/teleop_twist", message=TWIST),
     Preset(
         "moveit_servo_twist",

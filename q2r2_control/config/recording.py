@@ -17,7 +17,7 @@ SubtaskSeconds = Annotated[float, Field(ge=0, le=3600)]
 
 
 class JudgeSettings(StrictModel):
-    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. A threshold of null is not checked.
+    """Thresholds of ``q2r2 judge``: an episode that fails any of them is discarded. A threshold of null is not checked.
 
     Shares are fractions of the time for which an arm is engaged, unless a description says otherwise. No threshold thus
     depends on the length of an episode. The package ``q2r2_control.judging`` computes the numbers.
@@ -150,13 +150,13 @@ DeviceText = Annotated[LocalPath, Field(min_length=1, max_length=500)]
 _LEAST_DISTANCE = 1e-6  # Least distance between a camera and the point that it looks at [m].
 _POSE_KEYS = ("position", "look_at", "rpy")  # Keys that only a simulated camera has.
 _DEVICE_KEYS = ("exposure", "rotation", "delay", "repeat", "depth")  # Keys that only a device has.
-REALSENSE = "realsense:"  # How ``device`` of a RealSense camera begins. A serial number follows.
+REALSENSE = "realsense:"  # The beginning of ``device`` for a RealSense camera. A serial number follows.
 
 
 class CameraConfig(StrictModel):
     """A camera of the simulated cell, a real camera on a ROS topic, or a device that this computer opens.
 
-    The simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
+    A simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
     up in the picture.
     """
 

@@ -42,7 +42,7 @@ def find_resource(path: str | os.PathLike[str]) -> Path:
         if str(path) and wanted.is_dir():
             raise ConfigError(f"{path}: a folder; allowed: the path of a file")
     except (OSError, ValueError, RuntimeError) as error:
-        # The name is too long, a folder may not be entered, or the user of a home folder is not known.
+        # The name is too long, entering a folder is not permitted, or the user of a home folder is not known.
         raise ConfigError(f"{path!s:.120}: cannot be looked up: {error!s:.120}") from error
     raise ConfigError(f"{path}: no such file here, nor among the shipped ones{_shipped(wanted)}")
 

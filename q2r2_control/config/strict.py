@@ -101,7 +101,7 @@ def config_error(
     """
     # If a key is misspelt, the right key is missing too. The misspelt key comes first, because it explains the fault.
     found = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-    # A value that fits none of several types has one fault for each of them. Only the first is kept.
+    # A value that fits none of several types has one fault for each type. Only the first of these faults is kept.
     lines = {_key(fault): place(fault["loc"]) + _line(fault, model) for fault in reversed(found)}
     faults = list(lines.values())[::-1]
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
@@ -170,7 +170,7 @@ Network = IPv4Network | IPv6Network
 
 
 def network_of(text: str) -> Network:
-    """Return the network ``text``, such as ``192.168.1.0/24`` or ``fd00::/64``. One address is a network of one host.
+    """Return the network ``text``, such as ``192.168.1.0/24`` or ``fd00::/64``. An address is a network of one host.
 
     Raises:
         ValueError: If the text is not a network. The message names the text and what is allowed.

@@ -19,5 +19,5 @@ def read_yaml(text: str) -> Any:
 
 
 def yaml_of(data: Any) -> str:
-    """Return data as a text, with keys in their order."""
+    """Return ``data`` as a YAML text. The keys keep their order."""
     return str(yaml.dump(data, Dumper=SafeDumper, sort_keys=False))

@@ -45,7 +45,7 @@ def _ipv4_addresses() -> Iterator[str]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():
             request = struct.pack("16s24x", name.encode())
-            with suppress(OSError):  # The interface has no address.
+            with suppress(OSError):  # The request fails if the interface has no address.
                 flags = struct.unpack_from("H", fcntl.ioctl(asked, _GET_FLAGS, request), 16)[0]
                 if flags & _UP and flags & _RUNNING and not flags & _LOOPBACK:
                     yield socket.inet_ntoa(fcntl.ioctl(asked, _GET_ADDRESS, request)[20:24])

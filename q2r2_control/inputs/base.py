@@ -79,7 +79,7 @@ class PolicySource(Input, Protocol):
         """Prepare for a run of ``robot``. If ``realtime`` is False, the loop has to wait for the policy's answers."""
 
     def chunks(self) -> list[ActionChunk]:
-        """Return the chunks that came since the last call, oldest first. The method never waits and never raises."""
+        """Return the chunks that came since the previous call, oldest first. The method never waits or raises."""
 
     def observe(self, observation: Observation) -> None:
         """Give the policy the observation of a tick, which does not change later. In real time, this never waits."""

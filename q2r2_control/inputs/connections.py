@@ -33,7 +33,7 @@ SILENCE_ALLOWED = 2.0
 TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
 # Greatest number of bytes in one read, about 40 messages. The control loop can run between two reads.
 _RECEIVE_BYTES = 1 << 12
-MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. Much more would delay the control loop.
+MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450 frames per second. Far more frames would delay the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
@@ -157,7 +157,7 @@ class Connections:
         """Decide which client drives. All data that were sent before ``now`` [s] have been read."""
         driver = self._driver
         if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
-            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # A silent driver would keep others out.
+            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # A silent driver would keep other clients out.
         for client in tuple(self._waiting):
             if not is_allowed(client.host, self._allow):
                 self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)

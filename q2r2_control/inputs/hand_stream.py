@@ -41,7 +41,7 @@ class HandStream:
         return self.peer is not None and not self._samples.is_cut
 
     def admit(self, peer: str) -> None:
-        """Let a headset drive from now on, and forget all data of an earlier one."""
+        """Let a headset drive from now on, and forget all data of an earlier headset."""
         self._watch.reset()
         self._tracker = HandTracker()
         with self._lock:
@@ -68,7 +68,7 @@ class HandStream:
                 self._samples.put(sample)
 
     def take(self) -> list[HandSample]:
-        """Return the samples since the last call, oldest first. Samples of a lost connection are left out."""
+        """Return the samples since the previous call, oldest first. Samples of a lost connection are left out."""
         return self._samples.take()
 
     def statistics(self, address: tuple[str, int], now: float) -> HeadsetStatistics:

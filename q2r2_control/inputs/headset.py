@@ -50,7 +50,7 @@ class HeadsetServer:
     controls = QUEST_CONTROLS
     options = ("host", "port", "say")
     executable = "tcp_endpoint"
-    url: str | None = None  # The app has no page.
+    url: str | None = None  # None, because this server serves an app and no page.
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class HeadsetServer:
 
     @property
     def driver(self) -> str | None:
-        """The address of the headset that drives; None if none does."""
+        """The address of the headset that drives; None if no headset drives."""
         return self._stream.peer
 
     def poll(self, now: float) -> list[HandSample]:

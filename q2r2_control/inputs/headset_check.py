@@ -68,7 +68,7 @@ class CheckedServer(Protocol):
 
 
 class HandWatch(Protocol):
-    """Watches the poses of both hands, and may warn about them. :class:`CrossedHands` is such a class."""
+    """Watches the poses of both hands, and can warn about them. :class:`CrossedHands` is such a class."""
 
     def add(self, sample: HandSample) -> None: ...
 
@@ -133,7 +133,7 @@ def watch_headset(
         missing = tuple(name for name in missing if name not in statistics.topics)
         silent = tuple(name for name, last in last_data.items() if now - last > SILENCE)
         if ends and not silent:
-            silent = missing  # Missing topics then count as silent, because there is no time left to wait for them.
+            silent = missing  # At the end, missing topics count as silent, because no time is left to wait for them.
         nothing_comes = len(silent) == len(last_data)
         warning = watch.warning(now)
         check = HeadsetCheck(

@@ -94,7 +94,8 @@ class HostLog:
                     self._hosts[host] = _Host(now)
 
     def _write(self, level: int, text: str) -> None:
-        self._logger.log(level, "%s", text)  # The text is no format string, since it may contain words of a client.
+        # The text is not the format string, because it can contain words of a client.
+        self._logger.log(level, "%s", text)
 
 
 # Accepting a connection occupies the interpreter for about 0.1 ms, and the control loop cannot run meanwhile. At the
@@ -163,7 +164,7 @@ def written(host: str, port: int) -> str:
 
 
 def why_not_bound(error: Exception) -> str:
-    """Return why an address cannot be bound. An OSError's own text repeats the address."""
+    """Return why an address cannot be bound. An OSError's own text is not used, because it repeats the address."""
     return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
 
 

@@ -18,7 +18,7 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures larger ones [m].
+_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures larger coordinates [m].
 
 
 class Move(NamedTuple):
@@ -67,7 +67,7 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
 
     Suppose that the left hand's measured rotation has an error of the tolerance's angle. In the left hand's axes, the
     right hand then seems to move, by this angle times the distance between the hands. The bound on ``seen`` includes
-    this motion. Otherwise less noise of the rotation would be allowed than the tolerance says.
+    this motion. Without it, less noise of the rotation would be allowed than the tolerance says.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -91,13 +91,13 @@ _STEP_GAP = 0.032
 # The next constants concern a frame that is carried along.
 _WINDOW = 1.5  # Duration of the recent motion that is judged [s].
 _CARRIED = 0.15  # Least distance that both hands have to move [m].
-_NEAR = 0.4 * _CARRIED  # If the left hand stays this near to one position, it is not carried along [m].
+_NEAR = 0.4 * _CARRIED  # If the left hand stays this near to one position, the frame is not carried along [m].
 _CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
 _SAME_TIME = 0.01  # Messages of the two hands within this time belong together [s].
 _ALIVE = 0.05  # A pose does not wait for the other hand if that hand has had no pose for longer than this [s].
 _LONGEST_GAP = 0.15  # The motion between two poses of a hand is not judged if the time between them is longer [s].
 # A moved frame counts as a fault only after this delay [s]. If the operator has aligned the frame, the message with the
-# pressed buttons may come after the first poses in the new frame.
+# pressed buttons can come after the first poses in the new frame.
 _CHORD_TIME = 0.04
 # A pose within this time after the press of an alignment is dropped, so that the receiver gets the buttons first [s].
 _CHORD_SEEN = 0.01
@@ -129,8 +129,8 @@ class MovedFrame:
         # Since this pair, the left hand has stayed within _NEAR of its position in the pair. The pair is set if
         # ``_pairs`` is not empty.
         self._near: HandPair
-        # The time at which a step of the hands' frame was detected that may be the operator's alignment [s]; None if
-        # there is no such step.
+        # The time at which a step of the hands' frame was detected [s]; None if there is no such step. The step is
+        # possibly the operator's alignment.
         self._suspected: float | None = None
         self._bad_until = -math.inf  # Until this time, poses count as faulty [s].
 

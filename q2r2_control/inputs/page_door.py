@@ -23,7 +23,7 @@ _PORT = re.compile(r":\d{1,5}$")
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
-    # No other page may embed this page. It could deceive the user into clicking this page's buttons.
+    # No other page may embed this page. Such a page could deceive the user into clicking this page's buttons.
     headers["X-Frame-Options"] = "DENY"
     return Response(status.value, status.phrase, headers, body)
 

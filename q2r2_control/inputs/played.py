@@ -21,7 +21,7 @@ _ROTATION_NOISE = math.radians(0.03)  # Standard deviation of the noise about ea
 
 
 class SampleTiming(ABC):
-    """The times at which the samples of one hand are measured, their noise, and the times at which they are received.
+    """For the samples of one hand: the times of their measurement, their noise, and the times of their receipt.
 
     For each sample, the caller takes the next of the ``times``, then calls ``measured`` once, and ``lateness`` once.
     """
@@ -56,7 +56,7 @@ class HeadsetSampling(SampleTiming):
     """Samples like a headset's samples: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
 
     Args:
-        hand: The hand. Each hand has other random numbers.
+        hand: The hand. Each hand has different random numbers.
         seed: Seed of all random numbers.
         position_noise: Standard deviation of the noise along each axis [m].
         tremor: Add the tremor of a human hand, 8-12 Hz with about 1 mm and 0.3 degrees.

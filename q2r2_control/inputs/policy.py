@@ -40,7 +40,7 @@ _JOINED = 1.0  # Longest time that the end of a run waits for a policy that stil
 class ActionSpace(StrEnum):
     """The kind of numbers in an action. Each value is the name of the dataset feature that has the same numbers.
 
-    The openings of all grippers may follow the numbers.
+    After these numbers, an action may contain the openings of all grippers.
     """
 
     JOINTS = "action"  # Joint positions of all arms [rad].
@@ -300,7 +300,7 @@ class PolicyInput:
         """Return the tool poses (n, 7) of each arm at joint positions (n, nv)."""
         robot = self._robot
         assert robot is not None
-        data = robot.model.createData()  # Each call has its own data, since any thread may send.
+        data = robot.model.createData()  # Each call makes its own data, because any thread may call ``send``.
         tools = {arm: np.empty((len(postures), 7)) for arm in robot.arms}
         for index, q in enumerate(postures):
             pin.forwardKinematics(robot.model, data, q)

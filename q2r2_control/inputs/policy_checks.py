@@ -25,7 +25,7 @@ def numbers_of(what: str, values: Any) -> Array:
     if values is None:
         raise UnusableError(f"{what} are None; allowed: an array of numbers")
     try:
-        return np.array(values, dtype=np.float64)  # A copy, since the sender may reuse the array.
+        return np.array(values, dtype=np.float64)  # A copy, because the sender can change its array later.
     except (TypeError, ValueError, OverflowError) as error:
         raise UnusableError(f"{what} = {shown(values)}; allowed: an array of numbers ({error})") from error
 

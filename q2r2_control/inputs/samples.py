@@ -62,7 +62,7 @@ class SampleQueue:
             self._samples.append(sample)
 
     def take(self) -> list[HandSample]:
-        """Return all samples since the last take, oldest first."""
+        """Return all samples since the previous call of this method, oldest first."""
         with self._lock:
             if self._takes_owed:
                 self._takes_owed -= 1
@@ -72,7 +72,7 @@ class SampleQueue:
             return samples
 
     def cut(self) -> None:
-        """Note that the connection is lost, and forget the queued samples, which may be old."""
+        """Note that the connection is lost, and forget the queued samples, which can be old."""
         with self._lock:
             self._samples.clear()
             self._takes_owed = 2

@@ -115,7 +115,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
 
 
 def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
-    """Return the motion of hands that do several named works one after the other. At the end they pause the arms."""
+    """Return the motion of hands that do several named works one after the other, and then pause the arms."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
@@ -144,7 +144,10 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
 
 
 def _from_home(points: Sequence[WayPoint], hand: str, precise: Sequence[tuple[float, float]]) -> Path:
-    """Return the motion of ``hand`` that moves its tool through ``points``, with precision in the spans ``precise``."""
+    """Return the motion of ``hand`` that moves its tool through ``points``.
+
+    In the time spans ``precise``, the hand moves its tool with precision.
+    """
     tool, home = WayPoints(points), np.array(HOME[hand])
 
     def displacement(t: float, frequency: float) -> tuple[Array, Array]:
@@ -168,7 +171,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """Return a random shift of all tasks' parts along x and y [m]. Both are between -``spread`` and ``spread``."""
+    """Return a random shift of all tasks' parts along x and y [m], each between -``spread`` and ``spread``."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
@@ -202,15 +205,16 @@ _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of 
 # The headset loses the hands once. These are the times from this loss [s] until the headset sees the hands again, until
 # the hands engage the arms, until they begin to carry again, and until they continue the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
-# The headset loses the hands after a fraction of the work in this range. So early, no tool presses on a part yet.
+# The headset loses the hands when a fraction of the work in this range is done. No tool presses on a part by then.
 _EARLY = (0.1, 0.45)
 _NO_PRESS = (0.3, 0.6)  # Hands do not hesitate within these times before and after a press [s].
 
 
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
-    """Return the same work of hasty hands. They are faster and hesitate, and the headset loses them once for a second.
+    """Return the same work, done by hasty hands.
 
-    After the loss, the hands wait until the headset sees them again, engage both arms again, and go on.
+    Hasty hands are faster and hesitate, and the headset loses them once for a second. After the loss, the hands wait
+    until the headset sees them again, engage both arms again, and go on.
     """
     assert work.duration is not None
     random, presses = np.random.default_rng([seed, len(SIDES)]), [*work.lower_presses, *work.grips]
@@ -261,7 +265,7 @@ HANDS_AT_REST = {
 _DROPOUT_PROBABILITY = 0.005  # Probability that a sample is lost.
 _DIFFERENCE = 1e-4  # Half the time step of a central difference of the ideal pose [s].
 DEFAULT_TRAJECTORY = "meet"
-# Length of an iiwa 7 from its first joint to its last. The motions are written for an arm of this length [m].
+# Length of an iiwa 7 from its first joint to its last joint. The motions are written for an arm of this length [m].
 _FULL_LENGTH = 1.12
 
 

@@ -217,7 +217,7 @@ def _topic_name(name: str) -> str:
     return bare
 
 
-_STAMPS_KEPT = 1000  # Number of times of receipt that are kept per topic. No headset sends so many messages a second.
+_STAMPS_KEPT = 1000  # Number of times of receipt that are kept per topic. No headset sends this many messages a second.
 
 
 @dataclass(frozen=True, slots=True)

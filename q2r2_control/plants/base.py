@@ -46,7 +46,7 @@ class Plant(Protocol):
     modes: tuple[CommandMode, ...]  # The modes of commands that this plant follows.
 
     def reset(self, q: Array | None = None) -> None:
-        """Start over at time 0, at rest at ``q`` (nv,) [rad] or at home, with open grippers; may raise PlantError."""
+        """Start over at time 0, at rest at ``q`` (nv,) [rad] or at home, with open grippers; can raise PlantError."""
 
     def apply(self, command: Command) -> None:
         """Take a command. Posture and velocity are due at the end of the next ``advance``; a torque acts at once.
@@ -236,9 +236,9 @@ def _check_block(name: str, plant: Any, config: Config) -> None:
 
 
 def is_mujoco(plant: object) -> TypeIs[MujocoPlant]:
-    """Return whether ``plant`` is a :class:`~q2r2_control.plants.mujoco.MujocoPlant`. MuJoCo may be missing.
+    """Return whether ``plant`` is a :class:`~q2r2_control.plants.mujoco.MujocoPlant`, even if MuJoCo is not installed.
 
-    Nothing is imported: before the module of the class is imported, no such plant exists.
+    Nothing is imported here, because no such plant exists before the module of the class is imported.
     """
     module = sys.modules.get(f"{__package__}.mujoco")
     return module is not None and isinstance(plant, module.MujocoPlant)
@@ -284,7 +284,7 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` if ``values`` does not have one finite number for each joint of the robot."""
     _check_shape(what, values, robot)
-    # A scalar product is a fast test. But the squares of large finite numbers may overflow. The numbers themselves are
+    # A scalar product is a fast test. But the squares of large finite numbers can overflow. The numbers themselves are
     # therefore checked if the product is not finite.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])

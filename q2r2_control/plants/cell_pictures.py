@@ -27,7 +27,7 @@ ENVIRONMENT = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
 def open_cameras(model: bytes, cameras: Mapping[str, CameraConfig]) -> CellPictures:
     """Open the cameras of a pickled ``mujoco.MjModel``; raises :class:`PlantError` if OpenGL is missing."""
     try:
-        # The import is here, because MuJoCo may need OpenGL when it is imported.
+        # The import is here, because importing MuJoCo can fail if OpenGL is missing.
         from q2r2_control.plants.mujoco_cameras import CellPictures
     except (ImportError, AttributeError, RuntimeError) as error:
         raise PlantError(f"no pictures: MUJOCO_GL={os.environ['MUJOCO_GL']}: {reason_of(error)}") from error
@@ -35,7 +35,8 @@ def open_cameras(model: bytes, cameras: Mapping[str, CameraConfig]) -> CellPictu
 
 
 def jpeg_of(picture: Array | np.ndarray, quality: int) -> bytes:
-    from PIL import Image  # The import is here, because runs without pictures import this module, too.
+    # Pillow is imported here, because runs without pictures, which do not need Pillow, import this module too.
+    from PIL import Image
 
     packed = io.BytesIO()
     Image.fromarray(picture).save(packed, "JPEG", quality=quality)

@@ -23,7 +23,8 @@ from q2r2_control.config.fri import MODBUS_DELAY, ModbusGripperConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.extras import install_line
 
-_OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # First register to write, and first to read. Three registers, of two bytes each.
+# First register to write, and first register to read. Three registers of two bytes each are written or read.
+_OUTPUTS, _INPUTS = 0x03E8, 0x07D0
 _PERIOD = 0.025  # Time between two readings. A new opening is written at the same time [s].
 _AGAIN = 1.0  # Time after which a lost connection is tried again [s].
 _TIMEOUT, _REPEATS = 0.3, 1  # Time to wait for an answer [s], and the number of repeated requests.

@@ -164,7 +164,8 @@ class MujocoPlant:
         self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
-            # A step may begin before the tick in which it ends. The servos then use the start of the tick for it.
+            # A step can begin before the tick in which it ends. For such a step, the servos use the posture and the
+            # velocity at the start of the tick.
             self._step(max(self._steps * self._timestep - start, 0.0) / dt)
         if not math.isfinite(self._qvel.dot(self._qvel)):
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")

@@ -21,15 +21,18 @@ from q2r2_control.types import Array
 with importing("sim", "the simulation in MuJoCo"):
     import mujoco
 
-# Rotation from the axes of a MuJoCo camera, which looks along -z with y up in the picture, to those of our cameras,
-# which look along x with z up.
+# Rotation from the axes of a MuJoCo camera to the axes of our cameras. A MuJoCo camera looks along -z, and y points up
+# in the picture. Our cameras look along x, and z points up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_STRAIGHT = 1e-9  # With a smaller sine of the angle to the vertical, the camera looks straight up or down.
+# If the sine of the angle between the line of sight and the vertical is smaller than this, the camera counts as looking
+# straight up or down.
+_STRAIGHT = 1e-9
 _LONGEST_CLOSE = 5.0  # Longest time to wait until a window is closed [s].
 _OPACITY = 0.6  # Opacity of moving obstacles.
-# Size of the shadow map [pixels], number of samples per pixel, and numbers of slices and stacks of round shapes. On a
-# computer without a graphics card, a picture with the first two settings of the window (8192 and 8) takes five times as
-# long, and a picture with MuJoCo's default numbers of slices and stacks (28 and 16) twice as long.
+# Size of the shadow map [pixels], number of samples per pixel, and numbers of slices and stacks of round shapes. Larger
+# values take longer on a computer without a graphics card. A picture takes five times as long with the values that
+# MuJoCo's window has for the first two settings (8192 and 8). It takes twice as long with MuJoCo's default numbers of
+# slices and stacks (28 and 16).
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
 
 
@@ -64,7 +67,10 @@ def _orientation(camera: CameraConfig) -> Array:
 
 
 class CellPictures:
-    """Takes pictures with the cameras of a model. One thread must do this, because an OpenGL context belongs to it."""
+    """Takes pictures with the cameras of a model. Only one thread may use an instance.
+
+    The reason is that an OpenGL context belongs to one thread.
+    """
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
         """Prepare pictures of a simulated cell.
@@ -156,7 +162,7 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData) -> mujoco.viewer.Han
 
 
 def close_window(window: mujoco.viewer.Handle) -> None:
-    """Close the window and wait for its thread. A thread that still draws when the process ends would crash it."""
+    """Close the window and wait for its thread. If a thread still draws when the process ends, the process crashes."""
     window.close()
     for thread in threading.enumerate():
         if "_launch_internal" in thread.name:  # The thread has the name of MuJoCo's function.

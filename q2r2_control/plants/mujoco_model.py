@@ -46,8 +46,9 @@ _NEGLIGIBLE_INERTIA = 1e-6
 # Coefficients of friction of rubber pads on a box: sliding, torsional [m] and rolling [m].
 _PAD_FRICTION = (1.0, TORSION, ROLLING)
 
-# Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales their stiffness with the inertia behind
-# them, which is small in a finger. With MuJoCo's usual 0.02 s the fingers would sink millimetres into the held part.
+# Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales the stiffness of a contact with the inertia
+# of its bodies, and a finger has little inertia. With MuJoCo's usual time constant of 0.02 s, the fingers would sink
+# millimetres into the held part.
 _PAD_STIFFNESS = (0.004, 1.0)
 
 # Formats of meshes that MuJoCo reads by itself.
@@ -91,9 +92,9 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 
 
 def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
-    """Return the names of all moving bodies without a mass, if no body that is fixed to them has a mass either.
+    """Return the names of all moving bodies that have no mass, and to which no body with a mass is fixed.
 
-    MuJoCo's own error names only one of them.
+    MuJoCo's own error names only one of these bodies.
     """
 
     def mass(body: mujoco.MjsBody) -> float:

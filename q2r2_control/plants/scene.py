@@ -9,7 +9,7 @@ from q2r2_control.robot.floor import FLOOR
 with importing("sim", "the simulation in MuJoCo"):
     import mujoco
 
-# Geom groups. MuJoCo's viewers draw 0 to 2, and others only on request.
+# Groups of geoms. MuJoCo's viewers draw the groups 0 to 2. They draw the other groups only on request.
 VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 
 
@@ -17,7 +17,7 @@ def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     """Add sky, lights and a plane for the floor, and set the view of a window.
 
     ``floor`` is True if the cell has a floor, whose boxes the plane replaces. Otherwise, the plane is only drawn, at
-    z = 0. It then causes no contacts, because the arms may move below it.
+    z = 0. It then causes no contacts, because the arms are allowed to move below it.
     """
     spec.add_texture(
         name="sky",

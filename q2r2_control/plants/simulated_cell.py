@@ -95,7 +95,7 @@ class SimulatedCell:
         self.robot = robot
         self.plant = MujocoPlant(robot, config)
         self.loose_objects = frozenset(config.mujoco.objects)
-        self.dropped = 0.0  # Total time that the simulation fell behind, or waited for torques [s].
+        self.dropped = 0.0  # Total time by which the simulation fell behind, or for which it waited for torques [s].
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
         # Results are kept, because senders name the same joints again and again.

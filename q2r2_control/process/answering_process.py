@@ -44,7 +44,7 @@ class AnsweringProcess:
             PlantError: If the process cannot begin.
         """
         self._robots, self._longest_word = robots, longest_word
-        # States that nobody reads may fill their socket. Commands and replies therefore have another socket.
+        # States that nobody reads can fill their socket. Commands and replies therefore have another socket.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)
@@ -52,7 +52,7 @@ class AnsweringProcess:
         with commands, states:
             self._process = start_python(f"from {module} import main; main{links}", {}, files=[*links, *files])
         self.pid = self._process.pid
-        # If the loop has a real-time priority, the process gets a higher one. Otherwise, the number that it gets is 0.
+        # If the loop has a real-time priority, the process gets a higher priority. Otherwise, it gets the number 0.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, *given)))
         word = b""
@@ -81,7 +81,7 @@ class AnsweringProcess:
         return word == self.TAKEN
 
     def said(self) -> Iterator[bytes]:
-        """Yield the states, as bytes, that the process has sent since the last call.
+        """Yield the states, as bytes, that the process has sent since the previous call of this method.
 
         Raises:
             PlantError: If the process has ended.

@@ -21,7 +21,7 @@ from q2r2_control.process.cluster_worker import Call, Needs, hash_of_sources, lo
 
 _CONNECT_S = 20.0  # Longest time to connect to the scheduler [s].
 _LOOK_S = 2.0  # While no job finishes, time between two checks whether any worker is left [s].
-# Packages whose versions may change the numbers in results.
+# Packages whose versions can change the numbers in results.
 _COMPARED = (
     *("q2r2_control", "dask", "distributed", "numpy", "scipy", "pin", "numba", "daqp", "osqp", "qpsolvers"),
     *("mujoco", "pillow", "mcap", "zstandard", "h5py", "pyarrow", "av", "lerobot"),

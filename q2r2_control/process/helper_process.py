@@ -96,9 +96,9 @@ class HelperProcess:
     def finish(self, patience: float, longest: float = math.inf) -> None:
         """Wait until the process has done all requests and has ended.
 
-        If it neither takes nor answers anything for ``patience`` [s] although processors are free, it is killed. It is
-        also killed if it has not ended after ``longest`` [s]. This method does not wait until a killed process has
-        ended.
+        If the process neither takes nor answers anything for ``patience`` [s] although processors are free, it is
+        killed. It is also killed if it has not ended after ``longest`` [s]. This method does not wait until a killed
+        process has ended.
         """
         self._ending = True
         self._queue.put(None)
@@ -124,14 +124,14 @@ class HelperProcess:
         self._killed = True
         # If the return code is set, the process has ended. The system may have given its ID to another process.
         if self._process.returncode is None:
-            with suppress(OSError):  # The process group has ended.
+            with suppress(OSError):  # The call fails if the process group has already ended.
                 os.killpg(self.pid, signal.SIGKILL)
         self._queue.put(None)
         self._listener.join(_AFTER_KILL)
 
     def _is_ready_to_run(self) -> bool:
         """Return whether at least one thread of the process runs or is ready to run. Only Linux tells this."""
-        with suppress(OSError):  # The thread has ended.
+        with suppress(OSError):  # Reading fails if a thread has ended meanwhile.
             states = [file.read_text() for file in Path(f"/proc/{self.pid}/task").glob("*/stat")]
             return any(state.rpartition(")")[2].split()[0] == "R" for state in states)
         return False
@@ -139,7 +139,7 @@ class HelperProcess:
     def _feed(self) -> None:
         stream = self._process.stdin
         assert stream is not None
-        with suppress(OSError):  # The process has ended.
+        with suppress(OSError):  # Writing fails if the process has ended.
             while True:
                 try:
                     entry = self._queue.get(timeout=self._idle)
@@ -206,10 +206,10 @@ def run_helper(module: str) -> None:
     """
     leave_signals_to_the_run()
     stream, sys.stdout = sys.stdout.buffer, sys.stderr  # The run must not read a library's output as an answer.
-    lock = Lock()  # Answers are sent one after the other, although several threads may send them.
+    lock = Lock()  # Only one answer is sent at a time, although several threads can send answers.
 
     def answer(content: Any) -> None:
-        with lock, suppress(BrokenPipeError):  # The run was killed.
+        with lock, suppress(BrokenPipeError):  # Writing fails if the run was killed.
             pickle.dump(content, stream)
             stream.flush()
 

@@ -65,7 +65,7 @@ HERE = ThisProcess()
 
 @dataclass(frozen=True)
 class Processes:
-    """Runs jobs in at most ``most`` processes of this computer. If the caller stops early, they are killed."""
+    """Runs jobs in at most ``most`` processes of this computer. If the caller stops early, the processes are killed."""
 
     most: int
     where = ""
@@ -90,7 +90,7 @@ class Processes:
                 " with what is made"
             ) from error
         except (KeyboardInterrupt, GeneratorExit):
-            # The processes are killed, because a job may take minutes.
+            # The processes are killed, because their jobs could take minutes.
             for process in set(active_children()).difference(others):
                 process.kill()
             raise

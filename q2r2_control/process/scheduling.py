@@ -17,7 +17,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 
-# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some of them and needs a lower one.
+# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some interrupts, so that it needs a
+# lower priority.
 _PRIORITY = 40
 LONGEST_END = 5  # Time that a process may take to end after it has closed everything. SIGALRM ends it then [s].
 _CURRENT, _FUTURE = 1, 2  # Flags of mlockall on Linux.
@@ -48,7 +49,7 @@ def real_time(priority: int = _PRIORITY) -> Iterator[str | None]:
 
 
 def reserve(runtime: float, period: float) -> bool:
-    """Reserve ``runtime`` [s] of a processor in every ``period`` [s] for the calling thread, before all others.
+    """Reserve ``runtime`` [s] of a processor in every ``period`` [s] for the calling thread, before all other threads.
 
     If threads under SCHED_FIFO leave no time for other programs, Linux halts them for up to 50 ms. A reservation
     (SCHED_DEADLINE) has precedence over this halt. A thread that needs more time waits for its next period.
@@ -107,7 +108,7 @@ def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
         return "no SCHED_FIFO: only asked for on Linux"
     try:
         for thread in threads:
-            with suppress(ProcessLookupError):  # The thread has ended meanwhile.
+            with suppress(ProcessLookupError):  # The call fails if the thread has ended meanwhile.
                 os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         return f"no SCHED_FIFO: {error.strerror}"

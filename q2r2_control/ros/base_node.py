@@ -52,13 +52,13 @@ _deadline = math.inf  # Time of the steady clock at which this process must have
 # The profile of a receiver of commands. Only the newest command counts, and it must arrive.
 COMMAND_QOS = QoSProfile(depth=1)
 # The profile of a sender of commands. A reliable sender repeats messages that have not arrived, also after the network
-# was down for a while. An old target would let the arm jump. The lifespan is measured by the sender's clock, and the
-# clock of the receiver may differ.
+# was down for a while. An old target would let the arm jump, so messages have a lifespan. It is measured by the
+# sender's clock, which can differ from the receiver's clock.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
 # the next one. A reliable subscription delivers in order: after a lost message, later messages would wait up to 3 s.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# The profile of messages that are only recorded. All of them are needed, but they may arrive late.
+# The profile of messages that are only recorded. All of them are needed, but a late arrival does no harm.
 RECORDED_QOS = QoSProfile(depth=200)
 # The profile of latched messages (transient local), such as robot_description. A node that subscribes later still gets
 # the last message.
@@ -73,7 +73,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class BaseNode(Node):
     """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String)."""
 
-    exit_code: int | None = None  # As soon as it is set, the executable ends with this exit code.
+    exit_code: int | None = None  # As soon as this exit code is set, the executable ends with it.
     ticks = False  # True if messages are taken only at the node's ticks, see TickExecutor.
     priority = 0  # Real-time priority, if the system permits it; 0 for the ordinary priority.
 
@@ -163,7 +163,7 @@ class BaseNode(Node):
         return float(self.get_clock().handle.get_now().nanoseconds) * 1e-9
 
     def tick_rate(self) -> float:
-        """Return the rate of the ticks that a subclass has counted in ``ticked`` since the last call [Hz]."""
+        """Return the rate of the ticks that a subclass has counted in ``ticked`` since the previous call [Hz]."""
         now = time.monotonic()
         rate = self.ticked / max(now - self._counted_at, 1e-9)
         self.ticked, self._counted_at = 0, now
@@ -197,13 +197,16 @@ class BaseNode(Node):
         """Close the node. It is called at the end, while the node can still publish."""
 
     def destroy_node(self) -> None:
-        """Destroy the node with its actions. rclpy would not destroy the actions, and the middleware could not end."""
+        """Destroy the node and its actions. rclpy alone would keep the actions, and the middleware could not end."""
         for action in [one for one in self.waitables if isinstance(one, (ActionClient, ActionServer))]:
             action.destroy()
         super().destroy_node()
 
     def clock_problem(self, timeout: float = _CLOCK_TIMEOUT) -> Reason | None:
-        """Return a reason if ROS time is simulated and has stood still for ``timeout`` [s] between calls, else None."""
+        """Return a reason if ROS time is simulated, and has not begun or stands still; else None.
+
+        It stands still if all calls of this method in the last ``timeout`` [s] of real time saw the same ROS time.
+        """
         clock: Any = self.get_clock()
         now, wall = self.now, time.monotonic()
         if now != self._ros_time[0]:
@@ -281,7 +284,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
 def run_node(*makes: Callable[[], BaseNode]) -> int:
     """Run the main function of an executable: make the nodes, spin until Ctrl-C or SIGTERM, and close them.
 
-    Several nodes share the process and its thread, and the end of one of them ends all. A wrong configuration gives one
+    Several nodes share the process and its thread. If one node ends, all nodes end. A wrong configuration gives one
     line on stderr and exit code 2.
 
     Returns:
@@ -329,7 +332,8 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
         end_in_time()
         if executor is not None:
-            executor.shutdown()  # Otherwise Python destroys its parts in any order, and rclpy prints a traceback.
+            # Without this call, Python would destroy the executor's parts in any order. rclpy would print a traceback.
+            executor.shutdown()
         for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()
@@ -343,7 +347,7 @@ def end_in_time() -> None:
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
-    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done earlier, without it."""
+    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done before that."""
     priority = max(node.priority for node in nodes)
     if not priority:
         return

@@ -1,7 +1,7 @@
 """Find other publishers of topics that may have one publisher only: hands, targets and commands.
 
-A publisher that appears is found in the graph within 0.04 s after the middleware has discovered it. A publisher that
-was there before and was silent is found by its first message.
+A publisher that appears is found in the graph within 0.04 s after the middleware has discovered it. An older
+publisher that was silent is found by its first message.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class CommandWatch:
         return self._found
 
     def named(self, reason: Reason) -> Reason:
-        """Return the reason with the names of its nodes, if they were unknown before and are known by now."""
+        """Return ``reason``. If names of nodes were unknown when it was made, it gets the names that are known now."""
         if reason.kind is not RosReason.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
             return reason
         return self._reason(reason.detail["topic"])

@@ -47,11 +47,11 @@ class TickExecutor(SingleThreadedExecutor):
         super().__init__(context=context)
         self._changed = True  # Whether timers, subscriptions or the like were made or destroyed.
         self._subscriptions: list[Any] = []  # Subscriptions, each with the number of arguments of its callback.
-        self._streams: list[Any] = []  # The subscriptions that have a publisher. Others need not be looked at.
+        self._streams: list[Any] = []  # The subscriptions that have a publisher. Other subscriptions need no check.
         self._ticks: list[Any] = []  # The timers of ticks.
         self._slow_timers: list[Any] = []  # All other timers, except those with a coroutine, which rclpy has to run.
         self._served_at = -math.inf  # Time of the last look at services, slow timers and silent topics [s].
-        self._simulated = False  # See _is_simulated.
+        self._simulated = False  # Whether a tick uses simulated time.
         self._rest = _RestOfNodes([], [])
 
     def add_node(self, node: Any) -> bool:
@@ -109,7 +109,7 @@ class TickExecutor(SingleThreadedExecutor):
         return min([longest, *(1e-9 * one for one in left if one is not None)])
 
     def _is_simulated(self) -> bool:
-        """Return whether a tick uses simulated time. This may change while a node runs."""
+        """Return whether a tick uses simulated time. This can change while a node runs."""
         return any(isinstance(timer.clock, ROSClock) and timer.clock.ros_time_is_active for timer in self._ticks)
 
     def _serve(self) -> None:

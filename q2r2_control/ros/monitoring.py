@@ -24,15 +24,17 @@ from q2r2_control.teleop.reasons import HOLD_REQUESTS
 _MAX_AGE = 0.1  # If the graph's last answer is older than this, the graph is asked again [s].
 _PERIOD = 2.0  # Time between two queries of the graph, if no other code queries it [s].
 _NO_WAIT = Duration(nanoseconds=0)
-# A subscriber may take 5 ms to acknowledge, which is longer than the period of a fast stream. Every _CHECK seconds
+# A subscriber can take 5 ms to acknowledge, which is longer than the period of a fast stream. Every _CHECK seconds
 # messages are therefore left out until the last one has been acknowledged, for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
 _ASKED = 0.02  # Time between two queries whether all messages were acknowledged [s].
 _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # A command that is older than this is not published [s].
-_LATELY = 32  # Number of sent messages that are remembered. The queue of the node's own subscription is shorter.
+_LATELY = 32  # Number of sent messages that are remembered. It exceeds the queue of the node's own subscription.
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
-_DISCOVERY = 2.0  # Time in which the node of every running arm has reported. Nodes report twice a second [s].
+# Within this time after the first query of the graph, the node of every running arm has reported [s]. Nodes report
+# twice a second.
+_DISCOVERY = 2.0
 _SILENT, _GONE = 2.0, 5.0  # Times without a report after which a node counts as silent, and as ended [s].
 _ARM = {"engaged", "ready", "hand"}  # The keys by which the report of an arm's node is recognised.
 # Names of nodes by the unique number of an endpoint. The graph loses a node that was frozen or unreachable for longer
@@ -41,7 +43,7 @@ _known: dict[bytes, str] = {}
 
 
 def node_of(endpoint: Any) -> str | None:
-    """Return the full name of the node to which an endpoint belongs; None if it was never known."""
+    """Return the full name of the node to which an endpoint belongs; None if this name was never known."""
     number = bytes(endpoint.endpoint_gid)
     if not endpoint.node_name.startswith("_NODE_NAME_"):  # rcl gives such a name if it does not know the node.
         _known[number] = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
@@ -58,7 +60,10 @@ class Publishers:
         node.create_timer(_PERIOD, partial(self._ask, *self._names), clock=STEADY)
 
     def of(self, topic: str) -> str:
-        """Return the full names of the nodes that publish on ``topic``, or that did so last; "" if there were none."""
+        """Return the full names of the nodes that publish on ``topic``.
+
+        If no node publishes now, these are the names of the last publishers; "" if there never was a publisher.
+        """
         if time.monotonic() - self._asked_at[topic] > _MAX_AGE:
             self._ask(topic)
         return self._names[topic]
@@ -119,7 +124,7 @@ class WatchedPublisher:
 
     @property
     def listeners(self) -> int:
-        """Return how many subscriptions of other nodes the ROS graph lists. It may still list nodes that have ended."""
+        """Return how many subscriptions of other nodes the ROS graph lists. It can still list nodes that have ended."""
         return int(self._publisher.get_subscription_count()) - self.own_listeners
 
     def is_own(self, data: bytes) -> bool:

@@ -43,7 +43,8 @@ _WAIT = 5.0  # Longest time to wait for joint states and for a receiver of the c
 # Time for which the plant listens for other commanders before it commands, so that they can be discovered [s].
 _QUIET = 1.0
 _CURE = "; start the robot, and see q2r2 ros doctor"
-_AWAY = 0.02  # If a command is farther than this from the measured joints, a new receiver lets the arms jump [rad].
+# If a command is farther than this from the measured joints [rad], a new receiver would let the arms jump.
+_AWAY = 0.02
 
 
 class _PlantNode(BaseNode):
@@ -193,7 +194,7 @@ class RosPlant:
 
     def state(self) -> RobotState:
         state = self._joints.state
-        assert state is not None  # A state has existed since the reset.
+        assert state is not None  # ``reset`` has waited for the first state.
         return state
 
     def gripper_openings(self) -> dict[str, float]:

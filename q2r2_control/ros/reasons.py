@@ -76,7 +76,8 @@ class RosReason(ReasonKind):
 
 
 _R, _S = RosReason, SupervisionReason
-# Reasons that say only that a node stood still or that data came late. Nobody has to look at the arms after them.
+# Reasons that say only that a node stood still or that data came late. After a stop for such a reason, nobody has to
+# look at the arms.
 LATENESS: frozenset[ReasonKind] = SILENCES | {
     *(_R.NODE_STALLED, _R.HAND_SILENT, _R.TRANSFORM_OLD),
     *(CommonReason.LOOP_STALLED, _S.STATES_SILENT, _S.TARGETS_CEASED),

@@ -21,7 +21,7 @@ from q2r2_control.types import ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
 _BINS = 100_000
-EVENTS_KEPT = 10_000  # Number of the newest events that are kept. A broken button can cause more events.
+EVENTS_KEPT = 10_000  # Only this number of the newest events is kept, because a broken button can cause far more.
 _FOLLOWED = 100.0  # Distance up to which the impedance pushes back with a growing force [mm].
 _REST = 1e-3  # The reference is at rest if no joint is faster [rad/s].
 
@@ -72,7 +72,8 @@ class TorqueSummary:
 
     # For each arm, the time for which its distance from the reference was larger than the impedance's error clip.
     off_reference_s: dict[str, float]
-    min_measured_distance_mm: float | None = None  # At the measured joint positions; None without a monitored pair.
+    # Least distance of a monitored pair at the measured joint positions; None if there is no monitored pair.
+    min_measured_distance_mm: float | None = None
     measured_closest_pair: tuple[str, str] | None = None
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
     max_wall_force_n: float = 0.0  # The greatest force of the wall on one pair.
@@ -126,7 +127,7 @@ class ArmSummary:
 
     @property
     def followed(self) -> bool:
-        """Whether the tool was near its reference at the end. A compliant arm may be ``_FOLLOWED`` [mm] away."""
+        """Whether the tool was within ``_FOLLOWED`` [mm] of its reference at the end; True if it was not measured."""
         return self.end_error_mm is None or self.end_error_mm <= _FOLLOWED
 
 

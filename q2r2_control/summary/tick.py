@@ -26,7 +26,7 @@ class RunStart:
 
 @dataclass(slots=True)
 class Tick:
-    """All data of one tick, for the listeners. They must not change it."""
+    """All data of one tick, for the listeners. The listeners must not change these data."""
 
     t: float  # Time since the start of the run [s].
     start: RunStart

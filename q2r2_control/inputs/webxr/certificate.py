@@ -27,7 +27,7 @@ def installation_folder() -> Path:
 def installation_token(folder: Path) -> str:
     """Return the token of the page's URL. It is the same in each run, so that a headset does not need a new URL.
 
-    A file that is too short, for example because the disk was full, could open no page. It is replaced.
+    If the file is too short, for example because the disk was full, its token could open no page. It is then replaced.
 
     Raises:
         InputError: If the token's file cannot be read or written.
@@ -99,7 +99,7 @@ def _made(names: list[str], now: datetime) -> bytes:
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"q2r2_control on {socket.gethostname()}"[:64])])
     made = (
         x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
-        # The certificate is valid from yesterday on, because the clock of a headset may be behind.
+        # The certificate is valid from yesterday on, because the clock of a headset can be behind.
         .not_valid_before(now - timedelta(days=1))
         .not_valid_after(now + _VALID)
         .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)

@@ -16,7 +16,7 @@ from q2r2_control.inputs.webxr.page_messages import PageMessage
 from q2r2_control.inputs.webxr.shown import FromRun, ShownVibration
 from q2r2_control.types import HapticFeedback
 
-MAX_MESSAGES_PER_SECOND = 300  # A page that sends more messages is dropped. Headsets send up to 120.
+MAX_MESSAGES_PER_SECOND = 300  # A page that sends more messages is dropped. Headsets send up to 120 per second.
 
 _LONGEST_REASON = 120  # Greatest length of the reason for which a socket is closed [bytes].
 
@@ -26,7 +26,7 @@ class PageClient(Peer):
 
     def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
         # A page keeps its number ``page`` when it is reloaded. Like the app's registrations, the number shows that a
-        # new connection is from the same page as before.
+        # new connection is from the same page as an earlier connection.
         super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
         self.connection = connection
         self.newest: PageMessage | None = None  # The newest message; None if it has been passed on.

@@ -157,7 +157,7 @@ class PageServer:
             sending.cancel()
             self._forget(client, client.reason or reason)
             if client.closing is not None:
-                await client.closing  # Otherwise the page would not get the reason.
+                await client.closing  # Without this wait, the page would not get the reason why its socket is closed.
 
     def _receive(self, client: PageClient, text: str | bytes) -> None:
         now = self._clock()

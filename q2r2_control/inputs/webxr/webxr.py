@@ -84,7 +84,7 @@ class WebXrInput:
     ) -> None:
         """Make an input, which listens on ``host`` and ``port`` after :meth:`start`.
 
-        A page that sends nothing for ``silence`` [s] is dropped. Long before, the teleop layer stops the arms.
+        A page that sends nothing for ``silence`` [s] is dropped. Long before that, the teleop layer stops the arms.
         """
         self.address = host, port  # After ``start``, the port is the bound port.
         self.urls: tuple[str, ...] = ()  # After ``start``, one URL for each address of this computer.

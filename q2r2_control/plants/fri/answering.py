@@ -64,8 +64,8 @@ class CabinetAnswers(AnsweringProcess):
     def receive(self) -> tuple[list[SessionState], list[tuple[float, float]]]:
         """Return the newest states of the sessions, and two times for each message that was answered.
 
-        Both contain only what has come since the last call. The two times are the message's arrival by the monotonic
-        clock, and the time from its arrival until its answer was sent [s].
+        Both contain only data that have come since the previous call of this method. The two times are the message's
+        arrival by the monotonic clock, and the time from its arrival until its answer was sent [s].
 
         Raises:
             PlantError: If the process has ended.
@@ -152,7 +152,7 @@ class _Answering:
             if reply is not None:
                 opened.sendto(reply, source)
                 state.took = time.monotonic() - came
-        except OSError:  # The cabinet cannot be reached. The loop notices that it is silent.
+        except OSError:  # The cabinet cannot be reached. The loop notices that the cabinet is silent.
             return
         with suppress(OSError):  # If the loop stalls, the socket has no space for this state. A later state follows.
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))

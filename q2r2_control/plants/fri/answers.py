@@ -6,8 +6,8 @@ velocity. If an answer were for the time at which its question arrived, the jitt
 The times of answers are therefore evenly spaced: each one is one period after the time of the newest answer that the
 cabinet has heard.
 
-**Catching up.** Lost messages and drift let the times of answers fall behind the questions. They catch up at a rate of
-1 + ``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the
+**Catching up.** Lost messages and drift let the times of answers fall behind the questions. These times catch up at a
+rate of 1 + ``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the
 velocity v and the acceleration a, the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration (1 +
 CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
@@ -30,7 +30,7 @@ from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # The rate at which the times of answers pass differs from 1 by at most this number.
 CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
-# If a cabinet's clock is slower than it was assumed, ``MessageClock`` adapts to it within this number of messages.
+# If a cabinet's clock is slower than assumed, ``MessageClock`` adapts to this clock within this number of messages.
 _SETTLED = 500
 _PIECES = 1024  # Number of pieces of the path that are kept. A piece is the motion of one tick, or a stop.
 # Number of answers whose time is remembered. At the shortest period of 1 ms, these answers span four times the lag
@@ -136,7 +136,7 @@ class ReferencePath:
 
 class _Answer(NamedTuple):
     time: float  # The answer contains the posture of the path at this time [s].
-    rate: float  # By how much this time is later than the time of the answer before, divided by the period [s/s].
+    rate: float  # The time of this answer minus the time of the previous answer, divided by the period [s/s].
 
 
 class MessageClock:
@@ -153,7 +153,7 @@ class MessageClock:
     def update(self, arrival: float, passed: float) -> None:
         """Update the estimate with a newer message, which came at ``arrival`` [s].
 
-        ``passed`` is the time between the message before and this message, by the cabinet's clock [s].
+        ``passed`` is the time from the previous message to this message, by the cabinet's clock [s].
         """
         self._taken += 1
         expected = self.expected + passed
@@ -209,8 +209,8 @@ class AnswerTimes:
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The rate minus 1 falls by at most CATCH_UP_RAMP per second. ``excess`` is the greatest value from which it
-        # reaches 0 not later than the lag does.
+        # The rate minus 1 can fall by at most CATCH_UP_RAMP per second. ``excess`` is its greatest value from which it
+        # can still fall to 0 by the time at which the lag becomes 0.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

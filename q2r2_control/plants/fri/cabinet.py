@@ -148,7 +148,7 @@ class Cabinet:
         self._answer: FriCommand | None = None  # Answer to the newest message that asked for one.
         self._in_time: deque[bool] = deque(maxlen=_WINDOW)  # Whether each of the newest answers came in time.
         self._misses = 0  # Number of answers that were missed one after the other until now.
-        # Number of answers that were missed while a client commanded. Misses after its last answer do not count.
+        # Number of answers that were missed while a client commanded, until the client's last answer.
         self.missed = 0
         self._overlay = False  # True if the application asks for the client's command.
         self._held: Joints = arm.q  # Position that the cabinet's own motion holds.

@@ -52,7 +52,7 @@ class Network:
 
     loss: float = 0.0  # Share of lost datagrams in each direction.
     duplicate: float = 0.0  # Share of messages that come twice.
-    jitter: float = 0.0  # Largest random delay of a datagram [s]. Later datagrams may overtake it.
+    jitter: float = 0.0  # Largest random delay of a datagram [s]. Later datagrams can overtake it.
     cut: float = 0.0  # Share of datagrams that lose their end, in each direction.
 
 
@@ -97,7 +97,7 @@ class SimulatedArm:
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Return the wanted position (n,) [rad] and velocity (n,) [rad/s] of the drives at ``t`` [s]."""
         share, change = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # When the next message is in time, ``share`` is 1, and the drives still move.
+        if share > 1.0 + _ROUNDING:  # If the next message is in time, ``share`` is 1 then, and the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * change), change / self._lasts
 
@@ -214,7 +214,7 @@ class CabinetServer:
         self._sent_at: dict[str, float] = {}  # Time of the newest message of each arm [s].
 
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
-        """Run until ``until``, called with the time since the start [s], returns True.
+        """Run until ``until`` returns True. The argument of ``until`` is the time since the start [s].
 
         ``tick`` is called after each message of a cabinet, with the time at which this message was due [s].
         """
@@ -274,7 +274,7 @@ class CabinetServer:
         while True:
             try:
                 datagram, source = self._sockets[arm].recvfrom(LONGEST + 1)
-            except OSError:  # There are no more datagrams, or no client listens yet.
+            except OSError:  # Reading fails if there are no more datagrams, or if no client listens yet.
                 return
             if source[:2] == self._clients[arm]:
                 for late in self._delays(0.0):
@@ -298,7 +298,7 @@ class CabinetServer:
 def _sent(opened: socket.socket, datagram: bytes, client: tuple[str, int]) -> None:
     try:
         opened.sendto(datagram, client)
-    except OSError:  # No client listens yet.
+    except OSError:  # Sending fails if no client listens yet.
         return
 
 

@@ -27,8 +27,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Command, CommandMode, RobotState
 
 # Time that is allowed from the start of a tick until the sessions have its commands [s]. The first value is the usual
-# one. After commands that came too late, it grows up to the second value, and the reference goes farther ahead by the
-# difference.
+# time. After commands that came too late, the time grows up to the second value, and the reference goes farther ahead
+# by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Shortest step of the reference, as a share of the loop's period.
 _SHORTEST = 0.5
@@ -106,8 +106,8 @@ class FriCell:
         late, self._now, before = now - self._now if following else 0.0, now, self._end
         longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
         self._longest_tick = max(self._period, min(longest, self._longest))
-        # While no arm follows, a session may have begun, and the loop may not know it yet. Each tick therefore moves
-        # the reference by one period.
+        # Even if no arm follows, a session can have begun already without the loop's knowledge. Each tick therefore
+        # moves the reference by one period.
         ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
@@ -130,7 +130,7 @@ class FriCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # The command of a reference at rest has no deceleration. Any positive number is then allowed here.
+            # If the reference rests, the command has no deceleration. Any positive number can be used instead.
             stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -145,7 +145,8 @@ class FriCell:
     def fault(self) -> Reason | None:
         """Return why the arms cannot be commanded at the newest tick.
 
-        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        If they can be commanded now, but could not at some time since the previous call of this method, return the
+        reason for that. Otherwise, return None.
         """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
@@ -160,7 +161,7 @@ class FriCell:
         return {arm: state.ended for arm, state in self.states.items()}
 
     def sent(self, taken: bool) -> None:
-        """Record whether the sessions have ``taken`` the commands of a tick, or one of them came too late."""
+        """Record whether the sessions have ``taken`` the commands of a tick. If one came too late, they took none."""
         self._withdraws = not taken
         if taken:
             self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
@@ -171,7 +172,8 @@ class FriCell:
     def _ahead(self) -> float:
         """The time from a tick to the end of the motion that it adds to the path [s].
 
-        If no tick and no command comes later than the recent ones, every answer is for a time before this end.
+        If no tick and no command is later than the recent ticks and commands, every answer is for a time before this
+        end.
         """
         return self._longest_tick + self._margin - _MARGIN
 
@@ -183,7 +185,7 @@ class FriCell:
         """Return the time from the end of a command until a tick measures the arm at the command's posture [s].
 
         A cabinet begins to move the arm to this posture with its next message, and takes one period for this motion.
-        The newest message is half a period old on average. With torques the result is 0, because they act at once.
+        The newest message is half a period old on average. With torques the result is 0, because torques act at once.
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
@@ -216,10 +218,10 @@ class FriCell:
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Return the measurements in the cabinets' newest messages. The stamp is the earliest arrival of these.
+        """Return the measurements in the cabinets' newest messages. The stamp is the earliest arrival of a message.
 
-        The held posture of an arm that can be commanded by positions is the end of its path. Other arms have the
-        measured posture there.
+        If an arm can be commanded by positions, its held posture is the end of its path. The held posture of any other
+        arm is its measured posture.
         """
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         knows_external = True

@@ -24,18 +24,18 @@ from q2r2_control.plants.fri.wire import (
 from q2r2_control.types import Array
 
 # An answer is for a time that is this much earlier than the arrival of its question [s]. Even on a busy computer, the
-# loop has computed the reference for this time by then.
+# loop has computed the reference for that time before the question arrives.
 DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
-_RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
+_RESTARTED = 1000  # If a message's counter goes back by more than this, the session has begun again.
 _COUNTERS = 1 << 32
 # A message's counter may have grown by at most twice the number of periods that have passed, plus this number.
 _MOST_AHEAD = 20
 # A torque without updates would push for ever. If it is older than the first of these times [s], it is replaced by a
 # torque that brakes. If it is older than the second time [s], the cabinet gets no answer, so that it ends the session.
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-# If the limit of the torques' rate is below this value, it is raised to it [Nm/s]. With the original limit, the damping
-# would come too late.
+# Least limit of the torques' rate [Nm/s]. A lower limit is raised to this value, because the damping would otherwise
+# come too late.
 _BRAKING_RATE = 5000.0
 # Greatest distance at which a reference may begin [rad]: with positions, from the position in which the arm is held;
 # with torques, from the arm's measured position.
@@ -46,7 +46,8 @@ _FROM_REST = 20.0  # Upper bound on the acceleration of a joint in the first tic
 class ArmSession:
     """The session of one arm.
 
-    While the arm follows the reference, the positions in its answers lie on ``path``. Otherwise they keep it at rest.
+    While the arm follows the reference, the positions in its answers lie on ``path``. At all other times, the positions
+    keep the arm at rest.
     """
 
     def __init__(
@@ -255,7 +256,7 @@ class ArmSession:
         time, state = self._times.at(*question), self.state
         wanted = self._clock.expected - self.waits - DELAY
         if abs(wanted - time) > message.period and self._rests(min(time, wanted)):
-            # The times may begin anew, because an answer may be for any time while nothing moves.
+            # While nothing moves, an answer may be for any time. The times of answers can therefore begin anew.
             self._times.restart()
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
@@ -289,7 +290,7 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
     """Let every arm take its command, and return True.
 
     If a command came too late, no arm takes its command, and False is returned. The arms then follow the certified stop
-    of the command before.
+    of the previous command.
     """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
@@ -301,7 +302,7 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: float) -> bytes | None:
     """Answer a cabinet's message as :meth:`ArmSession.answer` does, and let its arm wait for arms that are behind.
 
-    The wait is half the largest lag of the other arms. They catch up meanwhile, until no arm is behind.
+    The wait is half the largest lag of the other arms. The other arms catch up meanwhile, until no arm is behind.
     """
     lags = [other.state.timing(now).lag for name, other in sessions.items() if name != arm and other.state.following]
     sessions[arm].waits = 0.5 * max(0.0, *lags, 0.0)

@@ -15,7 +15,7 @@ from q2r2_control.types import ArmTiming
 TORQUE_PERIOD = 0.005
 _SILENT = 0.1  # A cabinet that sends no message for longer than this counts as silent [s].
 _LONGEST_LAG = 0.25  # An arm with a larger lag is not commanded, because its cabinet asks too seldom [s].
-_EARLY = 5e-4  # Time by which a message may come before it is expected [s].
+_EARLY = 5e-4  # Greatest time by which a message can come before it is expected [s].
 
 
 @dataclass

@@ -76,7 +76,7 @@ class Operation(IntEnum):
 
 
 class Drives(IntEnum):
-    """The state of an arm's drives. If the joints' drives differ, it is their lowest state."""
+    """The state of an arm's drives. If the drives of the joints have different states, it is the lowest of them."""
 
     OFF = 0
     TRANSITIONING = 1

@@ -143,7 +143,8 @@ class ArmFeedback:
             self._shown = now
             if not self._markers.get_subscription_count():
                 return
-            asked = None if sent is None else with_offset(sent, target.offset)  # The target of the measured tool.
+            # The pose that the measured tool should have.
+            asked = None if sent is None else with_offset(sent, target.offset)
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)
 

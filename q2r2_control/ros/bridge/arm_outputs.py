@@ -68,7 +68,7 @@ class ArmOutputs:
         self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
         self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
-            # The timeout is twice the usual one, because a target must arrive before the answer can be sent.
+            # The timeout is twice the usual timeout, because the controller reports only after a target has arrived.
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         service = preset.command_type
         self._command_type = (
@@ -77,7 +77,7 @@ class ArmOutputs:
         self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now, or None.
         self._relaying = False
         raw = not self._filtered and preset is not BUILTIN
-        # The built-in controller needs no such watch. Its reference may rest on purpose, such as near an obstacle, and
+        # The built-in controller needs no such watch. Its reference can rest on purpose, such as near an obstacle, and
         # is known here from its safe targets.
         self._stands = StandstillWatch(LAGGING_TOOL) if raw else None
         self._node, self._arm = node, arm
@@ -108,7 +108,7 @@ class ArmOutputs:
 
     @property
     def homing(self) -> tuple[bool, Reason | None]:
-        """Whether the built-in controller reports a motion home, and how the last motion home ended, or None."""
+        """Whether the built-in controller reports a motion home, and how the last one ended (None if not known)."""
         return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
@@ -146,7 +146,7 @@ class ArmOutputs:
             return None
         if (distance := self._stands.look(asked.translation, tool.translation, received, now)) is None:
             return None
-        self.forget(now)  # A repeated target could make the arm jump.
+        self.forget(now)  # If the last target were sent again, the arm could jump.
         takers = f" {name}" if (name := takers_of(self._node, self.first.topic)) else ""
         return _refused(standing(self._arm, takers, distance, "m"))
 
@@ -172,7 +172,7 @@ class ArmOutputs:
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
-        # The stream starts at the measured tool, because the safe target may differ from it by the arm's steady-state
+        # The stream starts at the measured tool, because the safe target can differ from it by the arm's steady-state
         # offset.
         self._relay.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)
@@ -250,7 +250,8 @@ class FollowWatch:
             self._since = math.inf
             self._followed_since = min(self._followed_since, now) if followed else math.inf
             return None
-        # If the controller seemed to follow for less than _ANSWER, the report about an earlier stream's end came late.
+        # If the controller seemed to follow for less than _ANSWER, it never followed this stream. Its report that an
+        # earlier stream had ended came late.
         dropped = now - self._followed_since > _ANSWER
         self._since, self._followed_since = min(self._since, now), math.inf
         if not (dropped or now - self._since > self._timeout):

@@ -41,7 +41,8 @@ from q2r2_control.ros.monitoring import publish_in_time
 from q2r2_control.types import Array, Reference, RobotState, StepStatus
 
 _STATUSES = tuple(StepStatus)
-# Time until a gripper moves to a granted opening [s]. The answer has to arrive, and ten goals are sent per second.
+# Time from the grant of an opening until the gripper moves to it [s]. The answer has to arrive, and the client then
+# waits for the next of its ten goals per second.
 GRIPPER_DELAY = 0.3
 _DISCOVERY = 1.0  # Time in which the latched messages of other nodes reach a new node, even on a busy machine [s].
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
@@ -173,7 +174,7 @@ class GripperLimits:
         }
 
     def awaits(self, now: float) -> bool:
-        """Return whether the last commanded opening of a measured gripper may still arrive over ROS.
+        """Return whether the last commanded opening of a measured gripper can still arrive over ROS.
 
         Without this opening, the fingers count as anywhere between closed and open. Arms that rest near an object would
         then move away from it.

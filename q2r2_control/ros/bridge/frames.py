@@ -45,7 +45,7 @@ class ReadTransform:
 
     @property
     def pose(self) -> pin.SE3:
-        """The pose, which is computed at its first use, because most links of an arm are never used."""
+        """The pose. It is computed at its first use, because the poses of most links are never used."""
         if self._pose is None:
             self._pose = pose_of_numbers(self.numbers)
             assert self._pose is not None
@@ -94,7 +94,7 @@ class FrameTree:
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
                 place = self._found[frame, within] = Placement(pose, received)
-                self._used.update(up, passed)  # ``up`` contains all ancestors of this common ancestor.
+                self._used.update(up, passed)  # ``up`` contains all ancestors of ``name``.
                 self._all = False
                 return place  # The placement is remembered until the next transform, which clears all placements.
         self._all = True
@@ -170,7 +170,7 @@ class FrameListener:
     def _read(self, topic: str, message: bytes) -> Sequence[ReadTransform]:
         try:
             return read_transforms(message)
-        except SerdeError:  # Another node is at fault.
+        except SerdeError:  # The bytes are no valid message. This is a fault of the sender.
             self._node.drop(f"/{topic}", f"{len(message)} bytes")
             return ()
 
@@ -189,7 +189,7 @@ class ToolFrame:
         self.problem: Reason | None = None
 
     def at(self, now: float) -> pin.SE3 | None:
-        """Return the newest pose at ``now`` [s], or None if it is not known. Then ``problem`` says why."""
+        """Return the newest pose at ``now`` [s]. If it is not known, return None, and ``problem`` says why."""
         placement = self._tree.find(self._frame, self._world)
         if placement is not None:
             self.received = placement.received
@@ -261,7 +261,7 @@ class PoseTopic:
     def _take(self, message: bytes, now: float) -> None:
         try:
             read = read_pose(message)
-        except SerdeError as error:  # The sender is at fault.
+        except SerdeError as error:  # The bytes are no valid message. This is a fault of the sender.
             self._node.drop(self.topic, str(error))
             return
         self._newest, self._pose = (read.frame, read.stamp, now), pose_of_numbers(read.numbers)

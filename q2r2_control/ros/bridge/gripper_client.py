@@ -1,4 +1,4 @@
-"""The client of an arm's gripper, for the kinds of grippers in use."""
+"""The client of an arm's gripper, for each ROS interface of :class:`GripperType`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class OpeningGrants:
     """Requests openings of one arm's gripper from the built-in controller: 0 closed .. 1 fully open.
 
     It publishes the wanted opening and the last commanded opening. From these, a restarted controller knows where the
-    gripper may be, and does not take an old request for a new one.
+    gripper can be, and does not take an old request for a new one.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, target_topic: str) -> None:
@@ -90,7 +90,7 @@ class GripperClient:
         self._begins = False  # True until the first command for the last request is sent.
         self._commanded_at = -math.inf  # Time of the last command [s].
         self._waits = False  # True while only a part of the requested motion is granted.
-        self._closes = False  # Whether the last request is a smaller opening than the request before.
+        self._closes = False  # Whether the last request is a smaller opening than the previous request.
         self._goals = 0
         self._publisher = self._client = None
         if settings.action_type is GripperType.FLOAT64_MULTI_ARRAY:

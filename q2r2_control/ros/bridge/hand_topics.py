@@ -25,7 +25,7 @@ from q2r2_control.ros.monitoring import Publishers, node_of
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
-_DEPTH = 10  # Queue length of publishers, which are reliable, so that any subscriber matches.
+_DEPTH = 10  # Queue length of publishers. They are reliable, because only reliable publishers match all subscribers.
 _KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
     MessageType.POSE: (PoseStamped, convert.hand_pose),
     MessageType.TWIST: (Twist, convert.hand_twist),
@@ -165,7 +165,7 @@ class HandIntake:
         """Take a pose, serialized or not."""
         try:
             self._pose = convert.hand_pose(message), self._received
-        except SerdeError as error:  # The sender is at fault.
+        except SerdeError as error:  # The bytes are no valid message. This is a fault of the sender.
             self._node.drop(_topic(self.hand, "pose"), str(error))
             return
         self._put()

@@ -44,8 +44,8 @@ from q2r2_control.wording import sentence
 _SHARED = "joint_states"  # The default topic of joint states.
 # If a target's delay exceeds the usual delay by more than this, the stamp does not say when the target is due [s].
 _LATEST = 0.02
-# The age of a target is the time from its stamp to its receipt. If a target is older than the target before was, by
-# more than this, its sender stood still between making and sending it [s].
+# The age of a target is the time from its stamp to its receipt. If it exceeds the age of the previous target by more
+# than this, the sender stood still between making and sending the target [s].
 _OLD = 0.5
 # Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period in
 # the mean period.
@@ -111,7 +111,7 @@ class TargetIntake:
     def _on_target(self, take: Take, arm: str, message: bytes | PoseStamped, info: Mapping[str, int | None]) -> None:
         try:
             made, frame_id, numbers = read_pose(message)
-        except SerdeError as error:  # The sender is at fault.
+        except SerdeError as error:  # The bytes are no valid message. This is a fault of the sender.
             self._node.drop(self.topics[arm], str(error))
             return
         frame, now = self.frames[arm], self._node.now
@@ -248,7 +248,7 @@ class JointIntake:
     ) -> None:
         try:
             message = read(data)
-        except SerdeError:  # Another node is at fault.
+        except SerdeError:  # The bytes are no valid message. This is a fault of the sender.
             self._node.drop(topic, f"{len(bytes(data))} bytes")
             return
         look(message)
@@ -295,10 +295,10 @@ class JointIntake:
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], npt.NDArray[np.intp]]:
         """Return names and indices of those joints of a topic that are in a message with the names ``given``.
 
-        A message may contain only some of them, because each arm may have its own publisher.
+        A message can contain only some of the topic's joints, because each arm can have its own publisher.
         """
         if (part := self._parts.get((topic, given))) is None:
-            if len(self._parts) >= _PARTS:  # The cache fills only if a publisher sends other names each time.
+            if len(self._parts) >= _PARTS:  # The cache fills only if a publisher sends new names again and again.
                 self._parts.clear()
             pairs = zip(self._names[topic], self._joints[topic], strict=True)
             found = {name: joint for name, joint in pairs if name in given}
@@ -308,8 +308,8 @@ class JointIntake:
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
         """Return the sender's own names of an arm's joints; [] if they cannot be found. They are logged once."""
         names = self._names[topic]
-        # Any robot may publish on the default topic. If messages with our names came on a topic, other names on it are
-        # not needed.
+        # Any robot can publish on the default topic. If messages with our names came on a topic, other names on this
+        # topic are not needed.
         if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:
             return []
         theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])
@@ -326,7 +326,7 @@ class JointIntake:
     def _on_external(self, read: Callable[[Any], JointNumbers], data: bytes | JointState) -> None:
         try:
             message = read(data)
-        except SerdeError:  # Another node is at fault.
+        except SerdeError:  # The bytes are no valid message. This is a fault of the sender.
             self._node.drop(self._external_topic, f"{len(bytes(data))} bytes")
             return
         if not set(message.name) >= set(self._joint_names):

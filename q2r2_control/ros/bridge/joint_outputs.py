@@ -128,7 +128,7 @@ class LbrPosition(Kind):
 
 
 class LbrTorque(LbrPosition):
-    """An LBRTorqueCommand of lbr_fri_idl, with torques without gravity, which KUKA's cabinet compensates itself.
+    """An LBRTorqueCommand of lbr_fri_idl. Its torques contain no gravity, which KUKA's cabinet compensates itself.
 
     Each message contains the measured position, because the driver ignores torques with a position of NaN.
     """

@@ -28,8 +28,8 @@ class LbrDrivers:
     """Listens to the drivers of the arms. Arms follow commands only in COMMANDING_ACTIVE, as with :class:`FriPlant`.
 
     Commands overlay a motion of the cabinet, whose position (``ipo_joint_position``) stays where the session began. The
-    first command of a session equals this position. After it, the arm is held at the last command. An arm is not ready
-    until its driver reports COMMANDING_ACTIVE, because joint states also come without a session.
+    first command of a session equals this position. After this command, the arm is held at the last command. An arm is
+    not ready until its driver reports COMMANDING_ACTIVE, because joint states also come without a session.
     """
 
     def __init__(

@@ -128,7 +128,7 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
-    takes_targets = external.terms.takes_targets  # Otherwise, ``rate`` and ``target_topic`` are for joint commands.
+    takes_targets = external.terms.takes_targets  # If False, ``rate`` and ``target_topic`` are for joint commands.
     return replace(
         given,
         preset=external.preset,

@@ -39,8 +39,8 @@ _HELD = 0.15, 0.6  # [m], [rad]
 class TargetOutput:
     """Publishes one arm's target, or its velocity, to one controller, through a :class:`PoseRateLimiter`.
 
-    The limiter starts at the tool, so that engaging moves nothing. When the target ends, the limiter brakes, and the
-    preset says whether the last pose is repeated then. The pose is not repeated if the tool is far from it, or if the
+    The limiter starts at the tool, so that engaging moves nothing. When no more targets come, the limiter brakes. The
+    preset says whether the last pose is then repeated. The pose is not repeated if the tool is far from it, or if the
     controller was restarted, because the arm would jump.
     """
 
@@ -73,7 +73,8 @@ class TargetOutput:
         self.last_sent: pin.SE3 | None = None  # The last target sent, in the world frame; None if there is none.
         self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
         self._sent_at = -math.inf  # Time of the last target of a stream that has not ended yet [s].
-        self._fault: Reason | None = None  # Why the controller is not the same as before; None if it is.
+        # The reason that the controller was restarted or has ended; None if neither has happened.
+        self._fault: Reason | None = None
         self._endpoints: set[bytes] = set()  # Endpoints of the controller.
         self._listeners = 0
         self._unknown = False  # Whether a subscriber's node is not known yet.
@@ -170,7 +171,7 @@ class TargetOutput:
         return twist_stamped(base.rotation.T @ linear, base.rotation.T @ angular, self._frame, now)
 
     def _end_stream(self, state: ArmState, now: float) -> None:
-        """If the operator paused the arm, publish the end of the stream. If it stops otherwise, publish nothing."""
+        """Publish the end of the stream if the operator paused the arm, but not if the arm stops for another reason."""
         if self._ends is None or state is not ArmState.PAUSED:
             self._sent_at = -math.inf
         elif _END_DELAY < now - self._sent_at < math.inf:
@@ -186,7 +187,7 @@ class TargetOutput:
         self.guard.reset(None, now)
 
     def _present(self) -> int:
-        """Return the number of subscribers. The graph may list some before the publisher can send to them."""
+        """Return the number of subscribers. The graph can list a subscriber before the publisher can send to it."""
         return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:

@@ -150,7 +150,7 @@ class TickInputs(NamedTuple):
 
     tool: pin.SE3 | None  # The measured tool pose.
     commanded: pin.SE3 | None  # The tool pose in the controller's reference, or the best substitute that is known.
-    reference: int | None  # Stamp of that reference by the controller's clock [ns]; None if there is none.
+    reference: int | None  # Stamp of the controller's reference by the controller's clock [ns]; None if there is none.
     obstacle: Reason | None  # Why the arm may not be engaged.
 
 
@@ -162,7 +162,11 @@ class TeleopLoop:
         self.teleop: Teleop
 
     def join(self, node: BaseArmController) -> None:
-        """Teleoperate this node's arm as well, before the first tick; raises :class:`ConfigError` if nodes differ."""
+        """Teleoperate this node's arm as well, from the first tick on.
+
+        Raises:
+            ConfigError: If the settings of this node differ from the settings of the first node.
+        """
         ours, first = node.parameters, (self.nodes or [node])[0]
         theirs = first.parameters
         for name in ("teleop", "rate", "mode", "builtin_node"):
@@ -193,8 +197,8 @@ class TeleopLoop:
             for node in nodes:
                 node.feedback.haptics.start_pulse(Event(now, node.arm_name, node.state, node.state, reason))
         faults = {node.arm_name: node.begin_tick(now) for node in nodes}
-        # The time is read after the nodes were judged, because the process may have been frozen in the middle of this
-        # tick. A gap in the node's own ticks is checked first, because it makes other nodes look silent.
+        # The time is read again here, because the process may have been frozen since the start of this tick. A gap
+        # between ticks of this process is handled before the faults, because such a gap makes other nodes look silent.
         gap, self._ticked = nodes[0].now - self._ticked, now
         if gap > teleop.settings.gate.timeout:
             self._pause(now, Reason.of(RosReason.NODE_STALLED, duration=gap))
@@ -230,7 +234,7 @@ class TeleopLoop:
             self.teleop.pause(now, reason)
 
     def _watch_time(self) -> None:
-        """Pause the arms if simulated time stands still. The hands still move, and arms must not follow this later."""
+        """Pause the arms if simulated time stands still. No arm may later make up for the hands' motion meanwhile."""
         timeout = self.teleop.settings.gate.timeout
         if (problem := self.nodes[0].clock_problem(timeout)) is None:
             return

@@ -25,7 +25,7 @@ from q2r2_control.types import Array
 
 _LITTLE_ENDIAN = b"\x01"  # The second byte of a serialized message.
 _STAMP = struct.Struct("<iI")
-_SECOND, _NANOSECOND = 0x1BADF00D, 987_654_321  # No other part of a template has these values.
+_SECOND, _NANOSECOND = 0x1BADF00D, 987_654_321  # They mark a stamp: no other part of a template has these values.
 _KEPT = 16  # Number of layouts that are remembered for each kind of message.
 
 
@@ -101,7 +101,7 @@ class _Walk:
 
     def __init__(self, data: bytes) -> None:
         self.data, self.offset = data, 4  # Alignment is relative to the end of the encapsulation, which has 4 bytes.
-        # Offsets and bytes of texts and lengths. The gaps between aligned parts may have any bytes.
+        # Offsets and bytes of texts and lengths. The gaps between aligned parts can contain any bytes.
         self.same = [(1, _LITTLE_ENDIAN)]
         if data[1:2] != _LITTLE_ENDIAN:
             raise SerdeError("not little endian, as every platform of this ROS is")
@@ -265,7 +265,7 @@ class TransformNumbers(NamedTuple):
 
 
 class _TransformLayout(NamedTuple):
-    same: tuple[tuple[int, bytes], ...]  # See _JointLayout.
+    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes of the parts that are equal in all messages of this layout.
     frames: tuple[tuple[str, str], ...]  # Child and parent of each transform.
     offsets: tuple[int, ...]  # Offset of the numbers of each transform.
 

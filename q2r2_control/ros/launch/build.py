@@ -45,7 +45,7 @@ class Interfaces:
 
     def found_in(self) -> Path | None:
         """Return the folder from which a new Python process imports all types, or None."""
-        # The path is the same as if this environment's setup file is sourced after a ROS's setup file.
+        # Libraries are found as if the setup file of this environment was sourced after the setup file of a ROS.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
         command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
         environment = os.environ | {"LD_LIBRARY_PATH": libraries}
@@ -104,7 +104,7 @@ def build_missing(report: Callable[[str], None]) -> None:
 def missing_tools(prefix: Path) -> list[str]:
     """Return one text for each thing that a build into ``prefix`` lacks. The text says where to get it."""
     missing = []
-    # Python's own folder is compared with this one, because Debian's own Python imports from another folder.
+    # ``packages`` is compared with Python's own folder, because Debian's own Python imports from another folder.
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")

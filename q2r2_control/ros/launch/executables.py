@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 # For each executable: the name of a module of ``nodes``, and the name of a class or function in this module. The class
-# is that of a node. The function runs several nodes.
+# is the class of a node. The function runs several nodes.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
     "SimulationInput": ("simulation_input", "SimulationInput"),
@@ -44,7 +44,7 @@ def _executable(name: str) -> Callable[[], int]:
         from q2r2_control.ros.base_node import end_in_time, run_node
 
         code = run_node(node_or_run) if isinstance(node_or_run, type) else int(node_or_run())
-        end_in_time()  # The time is limited, because the middleware may still work while the process ends.
+        end_in_time()  # The time is limited, because the middleware can still be at work while the process ends.
         return code
 
     return run

@@ -1,8 +1,8 @@
 """Set up Fast DDS, the middleware of ROS 2 Jazzy, for this process, unless the user has done so.
 
-Shared memory is switched off. A process that is killed while it holds a lock there delays all writers to the same
-memory, and all their subscribers, for about a second. A node that died leaves the graph after 3 s instead of 20 s, so
-that its successor counts as a second publisher for 3 s at most.
+Shared memory is switched off. If a process is killed while it holds a lock there, all writers to the same memory and
+all subscribers of these writers are delayed for about a second. A node that died leaves the graph after 3 s instead of
+20 s. If the node is started again, it therefore counts as a second publisher for 3 s at most.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ def set_up_middleware(environment: MutableMapping[str, str]) -> None:
     """Add the variables for Fast DDS before ``rclpy.init``, unless the user has set these or another middleware."""
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
-    # ROS_LOCALHOST_ONLY overrides the discovery range. With it, shared memory is used even if a profile disables it.
+    # ROS_LOCALHOST_ONLY overrides the discovery range. With this variable, shared memory is used even if a profile
+    # disables shared memory.
     if _PROFILES_FILE in environment or _TRANSPORTS in environment or environment.get("ROS_LOCALHOST_ONLY") == "1":
         return
     if environment.get(_RANGE) != "LOCALHOST":

@@ -25,12 +25,12 @@ from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_s
 from q2r2_control.ros.launch.build import build_missing
 from q2r2_control.types import SIDES
 
-_EXTRAS = {"mujoco_robot": "sim", "recorder": "data"}  # By node, the extra that it needs.
-NO_INPUT = "none"  # Another node sends the hands.
+_EXTRAS = {"mujoco_robot": "sim", "recorder": "data"}  # By node, the extra of this package that the node needs.
+NO_INPUT = "none"  # Another node sends the data of the hands.
 ROBOTS = ("auto", "mujoco", "none")
 # Time for a process to end, after SIGINT and then after SIGTERM; SIGKILL follows [s].
 _END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
-# The function is looked up here, because few calls are safe between fork and exec.
+# Few calls are safe between fork and exec. This function is therefore looked up before any fork.
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 _NAMESPACE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 # The log lines of a process begin with the name of the node. They are therefore passed on without the process's name.
@@ -141,11 +141,11 @@ class UpError(Q2R2Error):
 
 
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
-    """Start ``nodes`` and pass each line that they print to ``say``, after a name; returns the exit code.
+    """Start ``nodes`` and pass each line that they print to ``say``; returns the exit code.
 
-    This is the name of the node whose log contains the line, or else the name of the process.
+    Each line begins with the name of the node whose log contains the line, or else with the name of the process.
 
-    Ctrl-C or SIGTERM ends all of them. The exit code is then 0, or 3 if a node reports by this code that its recording
+    Ctrl-C or SIGTERM ends all nodes. The exit code is then 0, or 3 if a node reports by this code that its recording
     failed. If a node ends by itself, this is reported at once, the others are ended, and the exit code is 1. No node is
     restarted. Each node runs in a session of its own. Ctrl-C in a terminal therefore reaches the nodes only through
     this function, one after the other. If this process is killed, Linux interrupts all nodes, because arms must not

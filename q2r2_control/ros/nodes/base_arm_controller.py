@@ -91,7 +91,7 @@ class BaseArmController(BaseNode):
             self.destroy_node()  # A half-made node could keep the process from ending.
             raise
         # For its first log line, rclpy takes some 60 ms, because it searches all modules for the line's origin. This
-        # line is logged now, so that an operator's press does not wait for that.
+        # line is logged now, so that an operator's press does not wait for this search.
         self.get_logger().info(f"the {self.hand} hand moves the target on {self.outputs.first.topic}")
 
     def setup_parameters(self) -> ArmParameters:
@@ -234,7 +234,7 @@ class BaseArmController(BaseNode):
         if (held := self.outputs.gripper_held) is not None:
             return WARN, held, values
         if self.state in AT_REST:
-            # The last pause is shown, because the last event may be a refused press, whose reason no longer exists.
+            # The last pause is shown, because the last event can be a refused press, whose reason no longer exists.
             return OK, f"ready to engage ({self.feedback.paused})", values
         return OK, self.feedback.last_line, values
 
@@ -260,8 +260,8 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # If the safe target is away from an arm that holds, each press would engage the arm, and it would stop at once.
-        # It is therefore unready. An arm that follows may lag behind the safe target.
+        # If the safe target is far from an arm that holds, a press would engage the arm, and it would stop at once. The
+        # arm is therefore unready. An arm that follows can lag behind the safe target.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:

@@ -83,7 +83,7 @@ class CartesianControllerNode(ManagedNode):
             self._output.withheld = told.withheld
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
-        # Joint states with numbers that are not finite are a fault at once, because they come from another publisher.
+        # Joint states come from another node. If their numbers are not finite, this is a fault at once.
         watch.unusable_time = 0.0
         make_watching_live(self, streams, watch, external)
         self._watch = watch
@@ -130,7 +130,7 @@ class CartesianControllerNode(ManagedNode):
     def _standstill(self, output: str) -> StandstillLimits | None:
         """Return the limits above which a driver counts as standing still; None for compliant arms.
 
-        A person may prevent the motion of a compliant arm.
+        A person can prevent the motion of a compliant arm.
         """
         if output == NONE:
             return LAGGING_JOINTS
@@ -151,12 +151,12 @@ class CartesianControllerNode(ManagedNode):
     def _tick(self) -> None:
         decided = time.monotonic()
         if self._output.waits():
-            return  # This tick is missed, and the next one is late.
+            return  # Nothing is sent in this tick, and the next tick counts as late.
         now = self._clock_of_ticks.at(self.now)
         # ``dt`` is bounded, so that a late tick causes no jump, and a clock that was set back causes no motion.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # The gap is longer than the time that states may be missing.
+        if gap > max(LONGEST_DT, self._watch.timeout):  # The node stood still longer than joint states may be missing.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1

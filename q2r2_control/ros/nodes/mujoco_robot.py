@@ -44,7 +44,7 @@ _TRAJECTORY = "joint_trajectory"
 _REACHED = 0.02  # Distance from the goal that counts as reached, as a share of the stroke.
 _STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time has stalled [s].
 _MOVES = 0.004  # Least motion of a gripper that counts, as a share of the stroke.
-_OUTSIDE = 0.02  # A goal that exceeds the stroke by this share of it still counts as the stroke's end.
+_OUTSIDE = 0.02  # A goal that exceeds the stroke by at most this share of the stroke counts as the end of the stroke.
 _CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
 # The parts x y z w of the product of two unit quaternions, the first of which is inverted. Each part is a sum over the
 # products of the parts w x y z of both, with these factors.
@@ -62,12 +62,12 @@ _INVERSE_TIMES = np.array(
 class _Motion:
     handle: ServerGoalHandle
     goal: float  # Opening: 0 closed .. 1 open.
-    seen: float  # Opening at the last motion.
-    moved_at: float  # Time of the last motion [s].
+    seen: float  # Opening when the gripper last moved.
+    moved_at: float  # Time at which the gripper last moved [s].
 
 
 class GripperServer:
-    """Serves the action ``topic`` of a gripper. A new goal aborts the goal before.
+    """Serves the action ``topic`` of a gripper. A new goal aborts the previous goal.
 
     If the fingers stop on an object, the goal has succeeded, and its result says ``stalled``.
 
@@ -208,7 +208,7 @@ class MujocoRobot(BaseNode):
         self._tf_static.publish(fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
-        # The queue has two messages per arm. Each arm may have its own sender, and one sender's message must not
+        # The queue has two messages per arm. Each arm can have its own sender, and one sender's message must not
         # replace the other sender's message.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
         names, move, push = self._robot.joint_names, self._cell.command_velocities, self._cell.command_torques
@@ -231,14 +231,14 @@ class MujocoRobot(BaseNode):
     ) -> None:
         try:
             message = read(data)
-        except SerdeError:  # The sender is at fault.
+        except SerdeError:  # The bytes are no valid message. This is a fault of the sender.
             self.drop(_TRAJECTORY, f"{len(data)} bytes")
             return
         take(message, info)
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
         # Delays are watched separately for each topic and each first joint, because two controllers, each for one arm,
-        # may send on the same topic from hosts with different clocks.
+        # can send on the same topic from hosts with different clocks.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):

@@ -137,7 +137,7 @@ class RecorderNode(BaseNode):
             self.create_subscription(message, name, take, qos, raw=True)
 
     def _take(self, topic: Topic, told: bool, payload: bytes, info: Mapping[str, Any]) -> None:
-        """Keep a message until :meth:`_write`. ``told`` is True for an arm's event, which may be about an episode."""
+        """Keep a message until :meth:`_write`. ``told`` is True for an arm's event, which can be about an episode."""
         received = self._unix_time() - round(age(info) * 1e9)
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
         self._waiting.append(Message(topic.channel, number, received, max(sent, 0), bytes(payload)))
@@ -145,7 +145,7 @@ class RecorderNode(BaseNode):
             text = deserialize_message(payload, String).data
             try:
                 event = Event.from_json(json.loads(text))
-            except (ValueError, TypeError, KeyError):  # The message is in the file, but belongs to no episode.
+            except (ValueError, TypeError, KeyError):  # The message is recorded, but no event can be read from it.
                 self.drop(topic.name, f"{text!r:.60}")
                 return
             self._marks.follow(event.kind)

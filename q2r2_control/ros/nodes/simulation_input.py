@@ -22,10 +22,11 @@ _SHORTEST, _LONGEST = 0.001, 0.02  # Shortest and longest time between two check
 # At the first of these times of the script, the node decides whether the buttons are pressed. At the second time, it
 # decides whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
-# Time after the first motion of the hands in which an arm that stops is engaged again, while other nodes start [s].
+# For this time after the first motion of the hands, an arm that stops is engaged again [s]. Other nodes can still be
+# starting then.
 _SETTLES = 6.0
-# After that time, an arm is engaged again only if it can be engaged within this time after it followed last [s]. A node
-# that stood still works again within this time. A node that was killed counts as a second publisher for this time.
+# After ``_SETTLES``, an arm is engaged again only if it can be engaged within this time after it followed last [s]. A
+# node that stood still works again within this time. A node that was killed counts as a second publisher for this time.
 _RECOVERS = 3.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
@@ -118,7 +119,7 @@ class SimulationInput(BaseNode):
         if now <= self._until:
             self._listeners.look()  # Later, the arms are known, and the graph need not be asked any more.
         t = now - self._began
-        # The last event of an arm may be a request before the first press. Such a request does not count.
+        # The last event of an arm can be a request before the first press. Such a request does not count.
         self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
         all_follow = len(following) == len(self._hands)
         recovers = all_follow or (now - self._followed <= _RECOVERS and bool(self._listeners.lost()))

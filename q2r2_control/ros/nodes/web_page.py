@@ -91,8 +91,8 @@ class WebPage(BaseNode):
         self._start: RunStart | None = None
         self._events: list[Event] = []
         self._marks = EpisodeMarks()
-        # The numbers of the newest tick and of the last shown tick, and the longest computing time of a tick since
-        # then [s].
+        # The numbers of the newest tick and of the last shown tick, and the longest computing time of a tick after the
+        # last shown tick [s].
         self._number, self._shown, self._slowest = -1, -1, 0.0
         self._states, self._notice = NodeStates(self, namespace=self.get_namespace()), ""
         self._controller, self._recorder = self.name_in_set("cartesian_controller"), self.name_in_set(RECORDER)
@@ -133,7 +133,7 @@ class WebPage(BaseNode):
         self._waiting.append((topic.name, Message(topic.channel, 0, time.monotonic_ns(), 0, bytes(payload))))
 
     def _on_obstacle(self, marker: Marker) -> None:
-        with suppress(Q2R2Error):  # The controller's log gives the reason.
+        with suppress(Q2R2Error):  # The controller logs why it refuses the marker.
             obstacle, now = obstacle_of(marker, self.now), self.now
             check_obstacle(marker.ns, obstacle, self._cell.control.moving_obstacles)
             self._obstacles.pop(marker.ns, None)
@@ -160,8 +160,8 @@ class WebPage(BaseNode):
             case PageRequest.RESET:
                 return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]
             case PageRequest.RECORD:
-                # The marks of episodes that the page shows come first, because the node's state comes only twice a
-                # second.
+                # The page's own marks of episodes are used if there are any, because the recorder reports its state
+                # only twice a second.
                 told = self._marks.open if self._marks.any else states.get(self._recorder, {}).get("episode_open")
                 return [f"{self._recorder}/{'stop' if told else 'start'}"]
             case PageRequest.MARK | PageRequest.SUBTASK:

@@ -147,7 +147,7 @@ def _arms(view: SetView) -> Iterator[Finding]:
 
 
 def _cure(node: NodeView, line: str) -> str:
-    """Return the cure for the fault that a node reports. The lines of a refusal and of a stop contain the cure."""
+    """Return the cure for the fault that a node reports, or ``line`` if this line already contains the cure."""
     kind = node.values.get("kind")
     if kind in _CURE_IN_SENTENCE or node.values.get("state") == ArmState.STOPPED:
         return line
@@ -221,7 +221,10 @@ def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str],
 
 
 def _try_ros(environment: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, Any] | Finding:
-    """Start a node in another process, which tries ``packages``; return its answer, or why there is no node."""
+    """Start a node in another process, which also tries all ``packages``.
+
+    Return the answer of this process, or a finding that says why it could start no node.
+    """
     own = dict(environment)
     set_up_middleware(own)
     try:

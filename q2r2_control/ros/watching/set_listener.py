@@ -41,7 +41,8 @@ class SetListener:
         self._node, self._cell = node, cell
         self._drivers = DriverListener(node, cell) if drivers else None
         self._states = NodeStates(node, self._note)
-        self._sent: dict[tuple[str, str], deque[tuple[float, int]]] = {}  # By node and topic: times [s] and counts.
+        # By node and topic, the newest counts of messages that the node has reported, each after its time [s].
+        self._sent: dict[tuple[str, str], deque[tuple[float, int]]] = {}
         self._topics: dict[str, tuple[str, ...]] = {}  # The types by topic.
         self._publishers: dict[str, tuple[str, ...]] = {}
         self._subscribers: dict[str, tuple[str, ...]] = {}
@@ -141,7 +142,8 @@ def watch_set(
             listener.look()
             return listener.view()
         finally:
-            executor.shutdown()  # Otherwise Python destroys its parts in any order, and rclpy prints a traceback.
+            # Without this call, Python would destroy the executor's parts in any order. rclpy would print a traceback.
+            executor.shutdown()
             node.destroy_node()
     finally:
         rclpy.try_shutdown()

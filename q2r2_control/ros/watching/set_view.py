@@ -78,8 +78,8 @@ class TopicView:
 
     name: str
     types: tuple[str, ...]
-    publishers: tuple[str, ...]  # Full names of nodes.
-    subscribers: tuple[str, ...]  # Full names of nodes.
+    publishers: tuple[str, ...]  # Full names of the nodes that publish on the topic.
+    subscribers: tuple[str, ...]  # Full names of the nodes that subscribe to the topic.
     rate: float | None  # Messages per second [Hz]; None if not known.
 
 
