@@ -28,6 +28,17 @@ IDLE, USER_STOPPED = 1, 5  # Modes of the robot.
 REFLEX = 3  # The number of an error that ends in a reflex: a measured joint velocity is above its limit.
 
 
+class PunctualServer(FrankaSimServer):
+    """A robot that drops a command that comes after its millisecond, as the robot's control does.
+
+    libfranka's documentation says so (docs/network_requirements.rst). By default, franka-sim uses such a command, and
+    takes back the motion that it has made meanwhile.
+    """
+
+    def _absorb_within_motion_limits(self, command: object, *, fresh: bool) -> bool:
+        return fresh and super()._absorb_within_motion_limits(command, fresh=fresh)
+
+
 def write_model(urdf: Path, path: Path) -> None:
     """Write the MuJoCo model of franka-sim's URDF, so that nothing has to be downloaded. It has no meshes."""
     robot = ElementTree.fromstring(urdf.read_text())
@@ -62,7 +73,7 @@ def main(host: str, model: str, *posture: str) -> None:
     mujoco_franka_sim.ARM_INITIAL_Q[:] = [float(angle) for angle in posture]
     write_model(FrankaSimServer.DEFAULT_ARM_URDF, Path(model))
     os.environ["FR3_MJCF"] = model
-    server = FrankaSimServer(
+    server = PunctualServer(
         host=host, enforce_comm_constraints=True, enforce_motion_limits=True, gripper_object_width=OBJECT_WIDTH
     )
     threading.Thread(target=obey, args=(server,), daemon=True).start()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from q2r2_franka import limits
 
 from q2r2_control import ConfigError, Robot, load_config
 
@@ -30,3 +32,15 @@ def test_arms_move_at_a_tenth_of_their_speed_unless_all_robots_are_simulated_on_
         robots = {"left": {"address": "127.0.0.2"}, "right": {"address": right}}
         cell = config.model_copy(update={"plant_settings": {"franka": robots}})
         assert FrankaPlant.drives_real_arms(cell) is is_real, right
+
+
+def test_a_joint_that_brakes_before_its_position_limit_is_slower_than_an_fr3_allows_there() -> None:
+    config = load_config("plugins/q2r2_franka/dual_fr3.yaml")
+    robot = Robot.from_config(config)
+    joints = robot.arms["left"].joints
+    deceleration = robot.capped_acceleration(config.control.acceleration_limit)[joints]
+    margin, fastest = config.control.position_margin, config.control.velocity_scale * limits.VELOCITY
+    for distance in np.arange(margin, 2.0, 1e-3):
+        braking = np.minimum(np.sqrt(2.0 * deceleration * (distance - margin)), fastest)
+        _, allowed = limits.velocity_limits(limits.UPPER - distance)
+        assert (braking <= allowed - 0.1).all()
