@@ -146,7 +146,7 @@ def test_a_command_that_needs_a_missing_subpackage_names_it_in_one_line(command:
 
 CHECK, DOCTOR = ("check", "config/dual_iiwa7.yaml"), ("doctor", "--json")
 SHORT_RUN = (*RUN[:-1], "0.1")
-# This prints the public names that need a package of an extra.
+# This program prints the public names that cannot be used without the packages of an extra.
 PUBLIC_NAMES = (
     "-c",
     """

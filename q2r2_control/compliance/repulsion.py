@@ -147,8 +147,8 @@ def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tupl
         if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
             continue
         distance = measure(model.collision, data.collision, p)
-        # If a pair that may touch penetrates, its distance counts as 0 in the search for the closest pair. Otherwise it
-        # would hide a pair that must not touch.
+        # The bodies of a pair that may touch can overlap. Their distance is then negative, and counts as 0 when the
+        # closest pair is searched. Otherwise a pair that must not touch, and that overlaps less, would not be found.
         apart = max(distance, 0.0) if model.shell[p] < 0.0 else distance
         if apart < least:
             least, closest = apart, p

@@ -42,7 +42,7 @@ class _PartLibrary(JITCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """This library itself. Numba passes a kernel's Python objects to the ``set_env`` of ``codegen``."""
+        """This library itself. Numba stores a kernel's Python objects by a call of ``library.codegen.set_env``."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:

@@ -124,7 +124,10 @@ def note_on_parts(motion: str, config: Config) -> str | None:
 
 
 def with_controls(config: Config) -> Config:
-    """Return the cell with controls for ``carry`` and ``precision``, which tasks need, unless it has such controls."""
+    """Return the cell with controls for ``carry`` and ``precision``, because tasks need both.
+
+    A control is added only for an action that has no control in the cell yet.
+    """
     bindings = config.teleop.bindings
     given = {control: action for control, action in _TASK_CONTROLS.items() if bindings.words_of(action) is None}
     teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update=given)})

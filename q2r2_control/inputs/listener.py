@@ -84,7 +84,10 @@ class HostLog:
             known.level, known.text = level, text
 
     def flush(self, now: float) -> None:
-        """Write the lines whose second is over. At ``now`` = inf, all lines are written."""
+        """Write one of the lines that are held back, for each host whose last line is at least ``LINES_PERIOD`` old.
+
+        With ``now`` = inf, this is done for all hosts.
+        """
         for host, known in list(self._hosts.items()):
             if now - known.since >= LINES_PERIOD:
                 del self._hosts[host]

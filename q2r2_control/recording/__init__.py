@@ -1,4 +1,7 @@
-"""Record runs, or messages of ROS nodes, as MCAP files by a writer in its own process; read, replay and play them."""
+"""Record runs or messages of ROS nodes as MCAP files, which a separate process writes; read and replay recordings.
+
+The recorded hands of a run can also be the input of a new run.
+"""
 
 from __future__ import annotations
 

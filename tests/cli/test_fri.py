@@ -97,7 +97,7 @@ def test_each_message_of_a_cabinet_says_how_many_messages_come_per_answer(fri_ce
 
 
 @pytest.mark.parametrize("arguments", [(), ("--source-port", "0")], ids=["client's port", "any port"])
-def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_an_option_changes_the_port(
+def test_a_cabinet_sends_from_its_own_address_and_from_the_same_port_number_as_its_client_unless_an_option_is_given(
     fri_cell: str, arguments: tuple[str, ...]
 ) -> None:
     port = load_config(fri_cell).fri["left"].port

@@ -63,7 +63,7 @@ def test_one_second_after_a_part_was_put_back_it_may_be_moved_again() -> None:
         ([LIES, GRIPPED, HELD], "put_back_mm", 100.0),
     ],
 )
-def test_lifting_fails_if_the_part_is_not_held_up_long_enough_and_put_back(
+def test_lifting_succeeds_only_if_the_part_is_held_up_long_enough_and_then_put_back(
     phases: list[Phase], name: str, figure: float
 ) -> None:
     judge = play(LiftJudge("part"), phases)

@@ -173,7 +173,9 @@ def test_the_pose_of_one_hand_does_not_wait_for_a_hand_that_sends_nothing() -> N
 
 @pytest.mark.parametrize("begins", [-0.03, 0.0001, 0.02], ids=str)
 @pytest.mark.parametrize("first", SIDES)
-def test_an_alignment_is_no_fault_whether_the_buttons_or_the_poses_come_first(first: str, begins: float) -> None:
+def test_an_alignment_of_the_frame_is_no_fault_whether_its_buttons_or_its_poses_come_first(
+    first: str, begins: float
+) -> None:
     messages = [*moved(resting(), stepped(0.3, 60.0)), (STEP_AT + begins, first, CHORD)]
     messages.append((STEP_AT + begins + 0.15, first, RELEASED))
     watched = handed_on(sorted(messages, key=lambda message: message[0]))

@@ -131,7 +131,7 @@ def start_arm(node: Any, processes: Processes, arm: str, mode: str) -> ArmRig:
     given = {
         **{"preset": PRESET, "mode": mode, "ctrl_prefix": prefix, "controller_node": "/theirs"},
         **{"base_frame_id": f"{arm}_link_0", "world_frame_id": "world", "teleop.linked": False},
-        **{"teleop.leash.distance": 0.0},  # Without a leash, no target waits for an arm that is late.
+        **{"teleop.leash.distance": 0.0},  # 0 means: no leash. Targets then do not wait for a late arm.
     }
     processes.start_node(f"{arm}_arm_controller", *patient(given))
     return rig

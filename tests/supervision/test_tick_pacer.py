@@ -89,7 +89,7 @@ def test_the_tick_clock_starts_anew_after_a_long_gap_and_after_the_clock_was_set
     assert clock.at(now + PERIOD) == pytest.approx(now + PERIOD)
 
 
-def test_the_tick_clock_stands_still_after_the_clock_was_set_back_by_less_than_a_period() -> None:
+def test_the_tick_clock_repeats_its_last_time_if_the_given_time_goes_back_by_less_than_a_period() -> None:
     clock = ten_ticks()
     last = clock.at(10 * PERIOD)
     assert clock.at(9.5 * PERIOD) == last

@@ -60,7 +60,7 @@ def test_a_fault_of_the_left_hand_stops_the_left_arm_and_a_linked_right_arm_unti
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
-def test_if_a_program_stops_an_arm_a_linked_arm_stops_too_unless_the_first_arm_already_holds(linked: bool) -> None:
+def test_a_program_that_stops_an_arm_also_stops_a_linked_arm_unless_the_first_arm_stood_still(linked: bool) -> None:
     driver = engaged(linked=linked)
     driver.teleop.pause(driver.now, Reason(TeleopReason.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})

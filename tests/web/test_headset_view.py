@@ -53,7 +53,8 @@ def test_each_press_of_the_buttons_home_pause_and_stop_reaches_the_run_once(run:
     wait_until(lambda: run.asked == ["home", "pause"])
     page.click("#stop")
     wait_until(lambda: run.asked == ["home", "pause", "stop"])
-    # The space key engages an arm here. It must not press the button again that was clicked last.
+    # From now on, the space key engages an arm. A browser would also press the last clicked button again at this key.
+    # The page has to prevent this.
     page.click("#fly")
     page.keyboard.press("Space")
     page.wait_for_timeout(500)

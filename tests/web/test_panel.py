@@ -22,7 +22,10 @@ from tests.viewer.conftest import tick_at
 
 
 class Shown:
-    """The panel of a run in which the page moves the arms, and a page that shows the panel. Every frame is drawn."""
+    """The panel of a run in which the page moves the arms, and a client that receives this panel as a browser does.
+
+    The fixture :func:`shown` lets the panel show every frame, although it usually skips frames that follow too soon.
+    """
 
     def __init__(self, robot: Robot, server: viser.ViserServer) -> None:
         self._robot = robot

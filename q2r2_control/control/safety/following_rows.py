@@ -1,13 +1,16 @@
 """Write the rows of the QP for an arm that moves behind another arm, in the same direction.
 
-The arm in front may stop alone (arm_skew.py). It may also still be at the posture that the reference had a window D [s]
-ago. Let n be the normal of a pair. Along n, the arm behind has the free distance
+The real arm in front may be late by up to a window D [s]: it may still be at the posture that the reference had D ago.
+It may also stop alone (arm_skew.py). The rows therefore use this earlier posture of the arm in front, and the posture
+in which the arm behind would come to rest. Let d be the distance of a pair at the reference, and let its normal n point
+from the arm behind to the arm in front. The free distance is
 
     B = d - min_distance - buffer - n'(motion of the front arm in the window) - n'(motion of the arm behind in a stop).
 
-As in separation_rows.py, a step may use up only a share of B. After the step, B has to be at least (1 - gain h) times
-its value before. The present motion of the arm in front counts only after D. In a step, B therefore changes by the
-motion that the arm in front had D ago, and by the present motion of the arm behind.
+As in separation_rows.py, a step of h [s] may use up only a share of B: after the step, B has to be at least
+(1 - gain h) times its value before. In a step, B changes by two motions: by the motion that the arm in front made D
+ago, and by the present motion of the arm behind. The present motion of the arm in front changes B only when the time D
+has passed.
 """
 
 from __future__ import annotations

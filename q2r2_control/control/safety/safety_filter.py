@@ -91,12 +91,12 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
 
 @kernel
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
-    """Return the first pair that does not allow the grown bodies; -1 if all pairs allow them.
+    """Return the first pair that forbids its bodies to grow; -1 if no pair forbids this.
 
-    The bodies have grown since the reference was certified. They are allowed if each of their pairs keeps its distance
-    at the reference, and the known stop keeps all pairs apart. The invariant then holds as if the bodies had always had
-    this size. No other stop is tried, because the arms may already be braking along the known stop. If a pair is too
-    close already, its bodies must not grow.
+    Some bodies in ``model`` are larger than when the reference was certified. This is allowed if two conditions hold.
+    At the reference, each pair of these bodies keeps its distance. During the known stop, all pairs keep their
+    distances. The known stop is then certified for the larger bodies too. No other stop is tried, because the arms may
+    already be braking along the known stop.
 
     Args:
         model: The model, with the grown bodies.

@@ -25,8 +25,9 @@ class PageClient(Peer):
     """A page that is connected. It may drive, wait or only watch."""
 
     def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
-        # A page keeps its number ``page`` when it is reloaded. Like the app's registrations, the number shows that a
-        # new connection is from the same page as an earlier connection.
+        # A page keeps its number ``page`` when it is reloaded. The number takes the place of the topics that a
+        # headset's app registers. Equal registrations show that a new connection is from the same client as an earlier
+        # connection.
         super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
         self.connection = connection
         self.newest: PageMessage | None = None  # The newest message; None if it has been passed on.

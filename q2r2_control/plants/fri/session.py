@@ -130,7 +130,11 @@ class ArmSession:
             self._damping, self._tau_came = np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
-        """Return whether the reference can have been at rest at the position of the arm one tick ago."""
+        """Return whether the arm can begin to follow with ``command`` without a jump.
+
+        This is so if the reference can have been at rest one tick ago, at the arm's position. With torques, this is the
+        measured position. Otherwise it is the end of the path, which the arm must have reached.
+        """
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
         if not torques and not self._rests(state.answered):

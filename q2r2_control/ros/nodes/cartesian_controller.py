@@ -128,9 +128,9 @@ class CartesianControllerNode(ManagedNode):
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _standstill(self, output: str) -> StandstillLimits | None:
-        """Return the limits above which a driver counts as standing still; None for compliant arms.
+        """Return the limits by which a driver that stands still is found; None if none has to be found.
 
-        A person can prevent the motion of a compliant arm.
+        A compliant arm may also stand still because a person holds it. Its driver is therefore not judged.
         """
         if output == NONE:
             return LAGGING_JOINTS

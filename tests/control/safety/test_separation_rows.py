@@ -138,7 +138,7 @@ def _least_free(name: str, q: Array, v: Array, duration: float, p: int) -> float
 
 @pytest.mark.parametrize("name", NAMES)
 def test_velocities_that_satisfy_the_rows_reduce_the_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
-    """Velocities that violate the rows reduce the free distance faster, so the rows are not too strict either."""
+    """The rows are not too strict either: velocities that violate them reduce the distance faster than allowed."""
     random, kept, broken = np.random.default_rng(5), 0, 0
     for seed in range(150):
         q, v = _state(name, seed, 0.4)

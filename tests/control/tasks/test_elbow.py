@@ -151,7 +151,7 @@ def moved_by(settings: ControllerSettings) -> float:
     return float(reference.q[2] - robot.home[2])
 
 
-def test_a_task_of_another_package_moves_the_arm_and_the_contract_holds() -> None:
+def test_a_task_of_another_package_moves_the_arm_and_no_tick_violates_the_contract_of_the_controller() -> None:
     settings = {"angle": float(cell("dual_iiwa7").robot.home[2]) + 0.3, "weight": 0.1}
     assert moved_by(ControllerSettings(tasks={"elbow": settings})) > 0.1
 

@@ -83,7 +83,8 @@ class VirtualCabinets:
         self.cell = FriCell(self._robot, states, self._period, self._longest, self._grippers)
         self.now, self._serial = _BEGIN, 0  # The loop begins later, at the time 0.
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
-        # For each arm, the positions that its cabinet follows. With torques, they are the measured positions.
+        # For each arm, the positions at each message of a session: the commanded positions that the cabinet follows or,
+        # in torque mode, the measured positions. After a session has ended, they are NaN.
         self.heard: dict[str, list[Array]] = {arm: [] for arm in self.cabinets}
         for arm in self.cabinets:
             self._at(self.now, self._send, arm)
