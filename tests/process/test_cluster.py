@@ -7,7 +7,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +31,24 @@ def square_or_die(folder: Path, number: int) -> int:
     if number == 3:
         die_once(folder)
     return number * number
+
+
+class DeadlyWork:
+    """Squares numbers. The first worker that receives this work ends at once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __reduce__(self) -> tuple[object, tuple[Path]]:
+        return received, (self._folder,)
+
+    def __call__(self, number: int) -> int:
+        return square(number)
+
+
+def received(folder: Path) -> Callable[[int], int]:
+    die_once(folder)
+    return square
 
 
 def kill(process: int, number: int) -> None:
@@ -72,6 +90,15 @@ def test_jobs_of_a_killed_worker_run_on_the_other_worker_and_each_result_comes_o
         assert list(place.results(partial(square_or_die, tmp_path), JOBS)) == list(HERE.results(square, JOBS))
         assert (tmp_path / "died").exists()
         assert place.where == f" ({os.uname().nodename}: {len(JOBS)})"
+
+
+@pytest.mark.slow
+def test_a_worker_that_ends_while_workers_are_compared_prevents_no_job(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    with dask_cluster(tmp_path) as cluster:
+        results = Cluster(cluster.address).results(DeadlyWork(tmp_path), JOBS)
+        assert list(results) == list(HERE.results(square, JOBS))
+        assert (tmp_path / "died").exists()
 
 
 @pytest.mark.slow
