@@ -35,7 +35,9 @@ STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late
 _MOST, _LONGEST = 8, 0.4  # Largest number of actions in a chunk, and longest duration of a chunk [s].
 _STOPS = 1.0  # Time in which all arms have to come to rest after the last action that is followed [s].
 _PERIODS = (0.02, 0.1)  # Range of the time between two actions [s].
-_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Each coordinate of a far target is one of these [m].
+_TOOLS = np.array(
+    [[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]]
+)  # Numbers from which the coordinates of far targets are drawn [m].
 
 
 class _Segment(NamedTuple):

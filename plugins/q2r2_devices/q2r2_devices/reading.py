@@ -9,7 +9,7 @@ from contextlib import suppress
 from threading import Event, Thread
 from typing import Any, Generic, Protocol, TypeVar
 
-from q2r2_control import HapticFeedback, InputError, Q2R2Error
+from q2r2_control import HandSample, HapticFeedback, InputError, Q2R2Error
 
 Reading = TypeVar("Reading", covariant=True)
 Say = Callable[[str], None]
@@ -144,6 +144,11 @@ class DeviceInput:
         except Q2R2Error:
             self.close()
             raise
+
+    def samples_of(self, hands: Mapping[str, Any], now: float) -> list[HandSample]:
+        """Return the samples of all hands at ``now`` [s]. ``hands`` are the RateHand or LeaderHand of each reader."""
+        polled = (its.poll(self._readers[hand].take(), now) for hand, its in hands.items())
+        return [sample for samples in polled for sample in samples]
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         """Do nothing, because none of these devices vibrates."""

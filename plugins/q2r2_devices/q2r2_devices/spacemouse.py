@@ -177,5 +177,4 @@ class SpaceMouseInput(DeviceInput):
         return cls(settings_of(config, "spacemouse", SpaceMouseSettings), say)
 
     def poll(self, now: float) -> list[HandSample]:
-        polled = (its.poll(self._readers[hand].take(), now) for hand, its in self._hands.items())
-        return [sample for samples in polled for sample in samples]
+        return self.samples_of(self._hands, now)

@@ -197,8 +197,7 @@ class LerobotInput(DeviceInput):
         return cls(settings_of(config, "lerobot", LerobotSettings), say)
 
     def poll(self, now: float) -> list[HandSample]:
-        polled = (its.poll(self._readers[hand].take(), now) for hand, its in self._hands.items())
-        samples = [sample for samples in polled for sample in samples]
+        samples = self.samples_of(self._hands, now)
         if "pedal" not in self._readers:
             return samples
         for held in self._readers["pedal"].take():
