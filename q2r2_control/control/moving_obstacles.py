@@ -120,7 +120,10 @@ class MovingObstacles:
         self.data.age[:] += time
 
     def _count(self) -> None:
-        """Let a pair count if its obstacle is present, and, for a pair of an object, if the object is held."""
+        """Choose the pairs that keep a distance: those whose obstacle is present.
+
+        A pair of an obstacle with an object keeps its distance only while a gripper holds the object.
+        """
         if not self._number:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))

@@ -42,9 +42,8 @@ class Line:
     session: ArmSession
     address: str  # Address of the cabinet. Datagrams from other addresses are ignored.
     file: int  # File descriptor of the socket.
-    newest: bytes | None = (
-        None  # The cabinet's newest message, which the process sends to the loop without decoding it.
-    )
+    # The cabinet's newest message, or None before the first one. The process sends it to the loop without decoding it.
+    newest: bytes | None = None
 
 
 class CabinetAnswers(AnsweringProcess):
