@@ -92,7 +92,6 @@ RUN = (
 # The subpackages that these commands need, and that are missing.
 NEEDS = {
     ("run", "config/dual_iiwa7_fri.yaml", "--plant", "fri"): "q2r2_control.plants.fri",
-    ("run", "config/dual_iiwa7.yaml", "--web"): "q2r2_control.viewer.web",
     ("ros", "up", "config/dual_iiwa7.yaml"): "q2r2_control.ros",
     ("fri-check", "config/dual_iiwa7_fri.yaml"): "q2r2_control.plants.fri",
     ("export", "csv", "run.mcap"): "q2r2_control.export",
