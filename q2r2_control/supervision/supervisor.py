@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -169,15 +170,17 @@ class Supervisor:
             number: The sequence number that the publisher gave the message; None if it is unknown.
             due: The time at which the tool should reach the target [s]; None if the tool should reach it at once.
         """
-        tools: list[pin.SE3] = []
-        if not self.targets.follows_on(arm, now):
-            tools.append(self._controller.tool_pose(arm))
-            if self._external is None and self._watch.state is not None:
-                tools.append(self._robot.tool_pose(self._watch.state.q, arm))
-        refusal = self.targets.offer(arm, pose, tools, now, number, self.no_targets, due)
+        refusal = self.targets.offer(arm, pose, partial(self._tools, arm), now, number, self.no_targets, due)
         if refusal is None and pose is not None:
             self.ceased = None
         return refusal
+
+    def _tools(self, arm: str) -> list[pin.SE3]:
+        """Return the poses at which a stream of targets may begin; see :meth:`TargetStream.offer`."""
+        tools = [self._controller.tool_pose(arm)]
+        if self._external is None and self._watch.state is not None:
+            tools.append(self._robot.tool_pose(self._watch.state.q, arm))
+        return tools
 
     @property
     def no_targets(self) -> Reason | None:

@@ -82,26 +82,27 @@ class TargetStream:
         self.reset()
         return was_following
 
-    def offer(self, pose: pin.SE3, tools: Sequence[pin.SE3], now: float) -> Reason | None:
+    def offer(self, pose: pin.SE3, tools: Callable[[], Sequence[pin.SE3]], now: float) -> Reason | None:
         """Take a target; returns why it is not followed, or None.
+
+        The caller has ended the stream by :meth:`expire` if its targets have ceased.
 
         Args:
             pose: The target.
-            tools: The poses at which a stream may begin: the reference's tool, and the measured tool if it is known.
-                With the measured tool, an arm that was pushed away from its reference can be engaged where it is. The
-                poses are not used, and may be missing, while the arm follows a stream.
+            tools: Returns the poses at which a stream may begin: the reference's tool, and the measured tool if it is
+                known. With the measured tool, an arm that was pushed away from its reference can be engaged where it
+                is. The function is not called while the arm follows a stream.
             now: The time of receipt [s].
         """
-        self.expire(now)
         last, self._last, self.stamp = self._last, pose, now
-        if self.following:
+        if self.pose is not None:
             self.pose = pose
             return None
         moved, turn = (math.inf, math.inf) if last is None else apart(pose, last)
         begins = moved >= _JUMP or turn >= _TURN
-        # The position may be near one pose of ``tools``, and the rotation near another one: an operator's first target
+        # The position may be near one of these poses, and the rotation near another one: an operator's first target
         # has the measured position and the commanded rotation.
-        distances, turns = zip(*(apart(pose, tool) for tool in tools), strict=True)
+        distances, turns = zip(*(apart(pose, tool) for tool in tools()), strict=True)
         distance, angle = min(distances), min(turns)
         if begins and distance <= self._settings.engage_distance and angle <= self._settings.engage_angle:
             self.pose = pose

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import pinocchio as pin
 
@@ -106,15 +106,10 @@ class TargetStreams:
 
         Between two messages, targets are extrapolated, see :class:`TargetExtrapolator`.
         """
-        return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
+        return {arm: None if stream.pose is None else self._lines[arm].at(now) for arm, stream in self._streams.items()}
 
     def follows(self, arm: str) -> bool:
         return self._streams[arm].following
-
-    def follows_on(self, arm: str, now: float) -> bool:
-        """Return whether an arm follows its stream, and a target that arrives at ``now`` [s] belongs to this stream."""
-        self._expire(arm, now)
-        return self.follows(arm)
 
     def age(self, arm: str, now: float) -> float:
         """Return the time since an arm's last valid target, followed or not [s]."""
@@ -124,7 +119,7 @@ class TargetStreams:
         self,
         arm: str,
         pose: pin.SE3 | None,
-        tools: Sequence[pin.SE3],
+        tools: Callable[[], Sequence[pin.SE3]],
         now: float,
         number: int | None,
         forbidden: Reason | None,
@@ -141,9 +136,10 @@ class TargetStreams:
             forbidden: Why no arm may follow targets now; None if arms may follow targets.
             due: See :meth:`TargetExtrapolator.put`.
         """
+        self._expire(arm, now)
         stream = self._streams[arm]
         breaks = 0 if number is None else self._sequences[arm].take(number, now, self._settings.timeout)
-        if not stream.following:
+        if stream.pose is None:
             self._lines[arm].reset()
         refusal = None if pose is None else stream.offer(pose, tools, now)
         if breaks:
