@@ -97,9 +97,8 @@ class OperatorSide:
         """Return and log the events of the arms since the previous call, with times since ``start`` [s]."""
         events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
         for event in events:
-            stopped = (
-                is_fault(event) and event.kind is not TeleopReason.RECORDING_ENDED
-            )  # The recorder has already logged the end of the recording.
+            # The recorder has already logged the end of the recording.
+            stopped = is_fault(event) and event.kind is not TeleopReason.RECORDING_ENDED
             if stopped or event.kind is TeleopReason.HANDS_CROSSED:
                 _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
             elif _logger.isEnabledFor(logging.DEBUG):
