@@ -16,10 +16,11 @@ from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config, ObstacleConfig
 from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
+from q2r2_control.config.plugin_settings import check_blocks
 from q2r2_control.config.presets import RAW_WARNING
 from q2r2_control.control.controller import CartesianController, check_settings
 from q2r2_control.errors import MissingPackageError, Q2R2Error
-from q2r2_control.plants.base import check_plant_settings, make_plant
+from q2r2_control.plants.base import make_plant
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.robot.cell_parts import load_model
 from q2r2_control.robot.kept_distances import kept_distances, near_at_home
@@ -92,7 +93,8 @@ def check_cell(config: Config) -> CellCheck:
     controls = getattr(source, "controls", None)
     if isinstance(controls, DeviceControls):  # The controls of other devices are known only when they are connected.
         config.teleop.bindings.check_device(controls)
-    unknown_blocks = check_plant_settings(config)
+    unknown_blocks = check_blocks(INPUTS, "input_settings", config.input_settings)
+    unknown_blocks += check_blocks(PLANTS, "plant_settings", config.plant_settings)
     robot = Robot.from_config(config)
     # Here the settings still contain the pairs that may touch, so that their names and numbers are checked too. The
     # kept distances below are for position mode, in which these pairs must not touch.

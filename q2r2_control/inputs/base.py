@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.plugin_settings import check_block
 from q2r2_control.errors import InputError, check_kind
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.robot.robot import Robot
@@ -36,6 +37,8 @@ class Input(Protocol):
     The order of use is ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is
     found by its name also has a class method ``from_config(config)``. Its class may have these further attributes:
 
+    - ``settings``: The :class:`StrictModel` of its block in ``input_settings``. The block is checked by it before
+      ``from_config`` is called, and by ``q2r2 check``.
     - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, except
       ``say``, which is a function that prints a line.
     - ``cell``: A function that gives a cell the settings that this input needs, such as the input's own axes.
@@ -139,12 +142,14 @@ def make_input(source: Input | str, config: Config, **options: object) -> Input:
             that the input does not have are ignored.
 
     Raises:
-        ConfigError: If the name is unknown, if ``source`` is neither a name nor an input, or if the input refuses an
-            option.
+        ConfigError: If the name is unknown, if ``source`` is neither a name nor an input, if the input refuses an
+            option, or if a value in its block of ``input_settings`` is not allowed.
     """
     if not isinstance(source, str):
         check_kind("input", source, Input, "the name of an input, or an object with all methods of Input")
         return source
     taken = {name: value for name, value in options.items() if name in options_of(source)}
-    made: Input = load_class(INPUTS, source).from_config(config, **taken)
+    found = load_class(INPUTS, source)
+    check_block("input_settings", source, found, config.input_settings)
+    made: Input = found.from_config(config, **taken)
     return made

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +13,10 @@ from typing_extensions import TypeIs
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
-from q2r2_control.config.strict import validated
+from q2r2_control.config.plugin_settings import check_block
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason
-from q2r2_control.plugins import PLANTS, load_class, names_of
+from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
@@ -205,34 +205,9 @@ def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
         check_kind("plant", plant, Plant, "the name of a plant, or an object with all methods of Plant")
         return plant
     found = load_class(PLANTS, plant)
-    _check_block(plant, found, config)
+    check_block("plant_settings", plant, found, config.plant_settings)
     made: Plant = found.from_config(robot, config)
     return made
-
-
-def check_plant_settings(config: Config) -> list[str]:
-    """Check each block of ``config.plant_settings`` by the attribute ``settings`` of the plant that it is for.
-
-    Returns:
-        A line for each block that is for no installed plant.
-
-    Raises:
-        ConfigError: If a value is not allowed. The message names the key.
-    """
-    unknown = []
-    for name in config.plant_settings:
-        if name not in names_of(PLANTS):
-            installed = ", ".join(names_of(PLANTS))
-            unknown.append(f"plant_settings.{name}: no installed plant has this name; installed: {installed}")
-        else:
-            _check_block(name, load_class(PLANTS, name), config)
-    return unknown
-
-
-def _check_block(name: str, plant: Any, config: Config) -> None:
-    """Check the block of a class of plants in ``plant_settings``; raises :class:`ConfigError` as its caller does."""
-    if name in config.plant_settings and (model := getattr(plant, "settings", None)) is not None:
-        validated(model, f"plant_settings.{name}: ", config.plant_settings[name])
 
 
 def is_mujoco(plant: object) -> TypeIs[MujocoPlant]:

@@ -244,10 +244,36 @@ def test_if_a_device_lacks_permission_the_start_fails_and_the_error_contains_the
 def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) -> None:
     with pytest.raises(ConfigError, match=r"^input_settings.spacemouse: no hand; allowed: a hand, as right: \{\}$"):
         make_input("spacemouse", cell("spacemouse"))
-    with pytest.raises(
-        ConfigError, match=r"^input_settings.spacemouse: SpaceMouseSettings: right.speed = 2: allowed: 1 or less$"
-    ):
+    with pytest.raises(ConfigError, match=r"^input_settings.spacemouse: right.speed = 2: allowed: 1 or less$"):
         make_input("spacemouse", cell("spacemouse", right={"speed": 2}))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "told"),
+    [
+        ("spacemouse", {"right": {"speed": 2}}, "input_settings.spacemouse: right.speed = 2: allowed: 1 or less"),
+        ("lerobot", {"right": {}}, "input_settings.lerobot: right.teleoperator: missing"),
+    ],
+)
+def test_the_command_check_names_a_wrong_setting_of_an_input_that_is_not_the_cells(
+    cell: Cell, tmp_path: Path, name: str, settings: dict[str, Any], told: str
+) -> None:
+    data = read_yaml(find_resource(CELL).read_text(encoding="utf-8"))
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml_of(data | {"input_settings": {name: settings}}))
+    cell(name)  # This call installs the entry points, so that the command finds them.
+    done = q2r2("check", str(file))
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert told in done.stderr
+
+
+def test_the_command_check_notes_settings_of_an_input_that_is_not_installed(tmp_path: Path) -> None:
+    data = read_yaml(find_resource(CELL).read_text(encoding="utf-8"))
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml_of(data | {"input_settings": {"space_mouse": {"right": {}}}}))
+    done = q2r2("check", str(file))
+    assert done.exit_code == 0, done.stderr
+    assert "input_settings.space_mouse: no installed input has this name; installed: " in " ".join(done.stdout.split())
 
 
 def test_the_command_run_finds_the_input_by_its_name_and_prints_one_line_about_a_missing_mouse(

@@ -29,7 +29,6 @@ from q2r2_control import (
 )
 from q2r2_devices.rate import RateHand, RateReading
 from q2r2_devices.reading import READ_TIMEOUT, DeviceInput, DeviceReader, Say, tell
-from q2r2_devices.settings import settings_of
 
 # HID Usage Tables 1.5, section 4: page and usage of a multi-axis controller.
 _MULTI_AXIS = 0x01, 0x08
@@ -156,6 +155,7 @@ def _hidapi() -> Any:
 class SpaceMouseInput(DeviceInput):
     """One or two SpaceMice as hands. Implements :class:`~q2r2_control.Input`."""
 
+    settings = SpaceMouseSettings
     controls = DeviceControls(buttons=("button_lower", "button_upper"), axes=(), words=_WORDS)
 
     def __init__(self, settings: SpaceMouseSettings, say: Say = tell) -> None:
@@ -174,7 +174,7 @@ class SpaceMouseInput(DeviceInput):
         Raises:
             ConfigError: If a setting is missing or not allowed.
         """
-        return cls(settings_of(config, "spacemouse", SpaceMouseSettings), say)
+        return cls(SpaceMouseSettings(**config.input_settings.get("spacemouse", {})), say)
 
     def poll(self, now: float) -> list[HandSample]:
         return self.samples_of(self._hands, now)

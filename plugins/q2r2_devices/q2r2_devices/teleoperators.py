@@ -34,7 +34,6 @@ from q2r2_devices.leader import LeaderArm, LeaderSettings, trigger_of
 from q2r2_devices.pedal import Pedal
 from q2r2_devices.rate import RateHand, RateReading
 from q2r2_devices.reading import DeviceInput, DeviceReader, Say, tell
-from q2r2_devices.settings import settings_of
 
 _WHERE = "input_settings.lerobot"
 _PERIOD = 1.0 / 75.0  # Shortest time between two readings of a teleoperator [s].
@@ -169,6 +168,7 @@ class LeaderHand:
 class LerobotInput(DeviceInput):
     """One or two teleoperators of lerobot as hands. Implements :class:`~q2r2_control.Input`."""
 
+    settings = LerobotSettings
     controls = DeviceControls(buttons=(), axes=("press_index", "press_middle"), words=_WORDS)
     cell = staticmethod(lerobot_cell)
 
@@ -194,7 +194,7 @@ class LerobotInput(DeviceInput):
         Raises:
             ConfigError: If a setting is missing or not allowed.
         """
-        return cls(settings_of(config, "lerobot", LerobotSettings), say)
+        return cls(LerobotSettings(**config.input_settings.get("lerobot", {})), say)
 
     def poll(self, now: float) -> list[HandSample]:
         samples = self.samples_of(self._hands, now)
