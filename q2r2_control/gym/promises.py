@@ -14,7 +14,8 @@ class StepPromises:
 
     def __init__(self) -> None:
         self._why: dict[str, str] = {}  # The reason of each arm's last event.
-        self._held: dict[str, None] = {}  # Arms and grippers that did less than asked in this step, with reasons.
+        # A line for each arm and gripper that did not carry out its action fully in this step, with the reason.
+        self._held: dict[str, None] = {}
         self._limits: dict[str, dict[str, None]] = {}  # The joints or pairs that reached a limit, by kind of limit.
         self.begin()
 

@@ -116,7 +116,10 @@ def set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
-    """Add a contact pair for each pad and obstacle that can touch. Its friction does not change the normal force."""
+    """Add a contact pair of MuJoCo for each pad and each obstacle that can touch.
+
+    In such a pair, the force of friction does not change the normal force. A finger can therefore slide.
+    """
     pads = [geom for body in spec.bodies for geom in body.geoms if geom.priority == PAD_PRIORITY and geom.contype]
     friction = config.mujoco.obstacle_friction
     for name in config.obstacles:

@@ -120,5 +120,5 @@ class RecordedHands:
 
 
 def _moved(sample: HandSample, later: float) -> HandSample:
-    """Return a sample whose times are ``later`` by this time [s]."""
+    """Return the same sample with both of its times moved by ``later`` [s]."""
     return replace(sample, pose_stamp=sample.pose_stamp + later, inputs_stamp=sample.inputs_stamp + later)

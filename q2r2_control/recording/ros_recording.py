@@ -261,7 +261,8 @@ class RosTicks:
         """
         if abs(reference - tick) < _CLOCK_SET:
             return reference < tick - _SAME
-        # The clock was set between the two, forward or back. Other waiting ticks and references show which is newer.
+        # The clock was set, forward or back, between the reference and the tick. Their times therefore cannot be
+        # compared. The other waiting ticks and references show which of the two is older.
         return not any(abs(other.now - reference) <= _SAME for other in self._due) and any(
             abs(other - tick) <= _SAME for other, _ in self._references
         )

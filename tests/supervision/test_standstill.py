@@ -149,7 +149,7 @@ def test_no_standstill_is_reported_before_a_whole_window_has_passed() -> None:
     assert found is not None
 
 
-def test_a_standstill_is_found_from_only_fifty_states_a_second() -> None:
+def test_a_standstill_is_noticed_even_if_only_fifty_states_come_in_a_second() -> None:
     asked = ramp(1.2, 8.0)
     assert list(findings(JOINTS, asked, state_period=0.02)) == []
     assert next(findings(JOINTS, asked, state_period=0.02, lag=0.008, frozen_at=FROZEN_AT)) <= FROZEN_AT + 0.12

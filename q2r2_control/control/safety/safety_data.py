@@ -92,7 +92,7 @@ class QuadraticPiece(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """Samples of the candidate's stop, written by stop_rollout.py."""
+    """The s samples of the candidate's stop, evenly spaced in time. stop_rollout.py computes them."""
 
     q: Array  # (s, nv)
     v: Array  # (s, nv)
