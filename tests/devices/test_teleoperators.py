@@ -80,6 +80,19 @@ def test_after_a_gap_between_two_polls_the_hand_moves_for_at_most_a_tenth_of_a_s
     np.testing.assert_allclose(sample.position, (0.01, 0.0, 0.0), atol=1e-12)
 
 
+def test_a_hand_that_was_lost_has_samples_again_in_a_run_whose_clock_begins_anew() -> None:
+    hand, rests = RateHand("left"), RateReading(np.zeros(6), HandInputs())
+    assert hand.poll([rests], 1000.0)
+    assert hand.poll([None, rests], 0.0)
+
+
+def test_a_hand_does_not_move_back_if_the_clock_goes_back() -> None:
+    hand = RateHand("left")
+    hand.poll([RateReading(FAST, HandInputs())], 5.0)
+    (sample,) = hand.poll([None, RateReading(FAST, HandInputs())], 4.0)
+    np.testing.assert_array_equal(sample.position, np.zeros(3))
+
+
 def test_the_settings_in_the_docs_are_accepted(cell: Cell) -> None:
     shown = [block for text in blocks_of("docs/headset.md", "yaml") for block in [read_yaml(text)]]
     given = {name: its for block in shown for name, its in block.get("input_settings", {}).items()}
