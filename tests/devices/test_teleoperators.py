@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from q2r2_devices import reading, teleoperators
 from q2r2_devices.rate import SILENCE, RateHand, RateReading
 
-from q2r2_control import Config, ConfigError, HandInputs, InputError
+from q2r2_control import Config, ConfigError, HandInputs, HandSample, InputError
 from q2r2_control.config.yaml_text import read_yaml
 from q2r2_control.inputs import adapted, make_input
+from tests.devices.mice import until
 from tests.support.modules import blocks_of
 
 Cell = Callable[..., Config]
@@ -41,6 +45,50 @@ def test_the_control_grip_is_a_dead_mans_switch_whatever_the_bindings_of_the_cel
         "trigger": "gripper_analog",
         "grip": "dead_man",
     }
+
+
+class Gamepad:
+    """A teleoperator with the methods of lerobot's gamepad. Its action is ``action``."""
+
+    name, is_connected = "gamepad", True
+    action_features: ClassVar = {"names": {"delta_x": 0, "delta_y": 1, "delta_z": 2, "gripper": 3}}
+
+    def __init__(self) -> None:
+        self.action: dict[str, float] = {"delta_x": 1.0, "delta_y": 0.0, "delta_z": 0.0, "gripper": 1}
+
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def get_action(self) -> dict[str, float]:
+        return self.action
+
+    def get_teleop_events(self) -> dict[Any, bool]:
+        return {}
+
+
+def test_a_gamepad_that_sends_nan_is_lost_and_its_hand_moves_on_from_the_same_place(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "_RETRY", 0.001)
+    gamepad, lines = Gamepad(), list[str]()
+    monkeypatch.setattr(teleoperators, "_made", lambda settings: gamepad)
+    source = make_input("lerobot", cell("lerobot", right=GAMEPAD), say=lines.append)
+    source.start()
+
+    def samples() -> list[HandSample]:
+        return source.poll(time.monotonic())
+
+    until(lambda: bool(samples()))
+    gamepad.action = gamepad.action | {"delta_y": np.nan}
+    until(lambda: len(lines) > 1)
+    assert lines[1].startswith("input_settings.lerobot.right: lost, delta_y = nan: allowed: a finite number; it is")
+    samples()
+    gamepad.action = gamepad.action | {"delta_y": 0.0}
+    found: list[HandSample] = []
+    until(lambda: bool(found.extend(samples()) or found))
+    assert np.isfinite(found[-1].position).all()
+    source.close()
 
 
 FAST = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.5])

@@ -9,7 +9,7 @@ from enum import StrEnum
 import pinocchio as pin
 from pydantic import Field
 
-from q2r2_control import Array, ConfigError, StrictModel
+from q2r2_control import Array, ConfigError, InputError, StrictModel
 
 POSITION = ".pos"  # lerobot's suffix of a joint's position in an action.
 GRIPPER = f"gripper{POSITION}"  # 0 closed .. 100 open.
@@ -83,10 +83,11 @@ class LeaderArm:
 
         Raises:
             KeyError: If a joint is missing in the ``action``.
+            InputError: If its position is not a finite number.
         """
         q = pin.neutral(self._model)
         for name, (at, direction) in self._joints.items():
-            value = direction * float(action[name])
+            value = direction * number_of(action, name)
             if self._settings.units is Units.DEGREES:
                 q[at] = math.radians(value)
             else:
@@ -98,5 +99,22 @@ class LeaderArm:
 
 
 def trigger_of(action: Mapping[str, float]) -> float:
-    """Return how far the gripper's handle is pressed, from 0 for open to 1 for closed; 0 if there is no handle."""
-    return min(max(1.0 - float(action.get(GRIPPER, 100.0)) / 100.0, 0.0), 1.0)
+    """Return how far the gripper's handle is pressed, from 0 for open to 1 for closed; 0 if there is no handle.
+
+    Raises:
+        InputError: If the position of the handle is not a finite number.
+    """
+    opening = number_of(action, GRIPPER) if GRIPPER in action else 100.0
+    return min(max(1.0 - opening / 100.0, 0.0), 1.0)
+
+
+def number_of(action: Mapping[str, float], name: str) -> float:
+    """Return a number of a teleoperator's action.
+
+    Raises:
+        KeyError: If it is missing.
+        InputError: If it is not a finite number.
+    """
+    if not math.isfinite(number := float(action[name])):
+        raise InputError(f"{name} = {number}: allowed: a finite number")
+    return number

@@ -30,7 +30,7 @@ from q2r2_control import (
     InputError,
     StrictModel,
 )
-from q2r2_devices.leader import LeaderArm, LeaderSettings, trigger_of
+from q2r2_devices.leader import LeaderArm, LeaderSettings, number_of, trigger_of
 from q2r2_devices.pedal import Pedal
 from q2r2_devices.rate import RateHand, RateReading
 from q2r2_devices.reading import DeviceInput, DeviceReader, Say, tell
@@ -119,7 +119,7 @@ class Teleoperator:
             return LeaderReading(*self._leader.tool(action), HandInputs(press_index=trigger_of(action)))
         if (gripper := int(action.get("gripper", _STAY))) != _STAY:
             self._trigger = float(gripper == _CLOSE)
-        deltas = np.clip([float(action[name]) for name in _DELTAS], -1.0, 1.0)
+        deltas = np.clip([number_of(action, name) for name in _DELTAS], -1.0, 1.0)
         velocity = np.concatenate([self._settings.speed * deltas, np.zeros(3)])
         return RateReading(velocity, HandInputs(press_index=self._trigger, press_middle=float(held)))
 
