@@ -74,6 +74,18 @@ def test_a_roll_of_the_wrist_turns_the_tool(tmp_path: Path) -> None:
             "leader.joints.a = free: not such a joint",
             id="a joint without an angle",
         ),
+        pytest.param(
+            NAMES,
+            {"joints": {"shoulder_pam": "shoulder_pan"}},
+            "leader.joints.shoulder_pam: not such a joint of the teleoperator; allowed: shoulder_pan, shoulder_lift",
+            id="a name that the teleoperator does not have",
+        ),
+        pytest.param(
+            NAMES,
+            {"joints": {"elbow_flex": "wrist_flex"}},
+            "leader.joints.elbow_flex: two joints move the same joint of the URDF; allowed: one",
+            id="two joints that are the same joint of the URDF",
+        ),
         pytest.param(["delta_x"], {}, "leader: the teleoperator gives delta_x; allowed: positions", id="no leader"),
     ],
 )

@@ -61,6 +61,15 @@ class LeaderArm:
                 f"leader: the teleoperator gives {', '.join(names)}; allowed: positions of joints, NAME.pos"
             )
         self._joints = {name: self._joint(name.removesuffix(POSITION)) for name in moving}
+        given = [name.removesuffix(POSITION) for name in moving]
+        if unknown := [name for name in settings.joints if name not in given]:
+            raise ConfigError(
+                f"leader.joints.{unknown[0]}: not such a joint of the teleoperator; allowed: {', '.join(given)}"
+            )
+        places = [at for at, _ in self._joints.values()]
+        for name, at in zip(given, places, strict=True):
+            if places.count(at) > 1:
+                raise ConfigError(f"leader.joints.{name}: two joints move the same joint of the URDF; allowed: one")
 
     def _joint(self, name: str) -> tuple[int, float]:
         """Return the index in q of the joint that lerobot calls ``name``, and its direction."""
