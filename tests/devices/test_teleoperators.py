@@ -39,6 +39,18 @@ def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) ->
         make_input("lerobot", cell("lerobot", right={}))
 
 
+def test_one_teleoperator_for_both_hands_is_refused(cell: Cell) -> None:
+    told = (
+        r"^input_settings.lerobot.right.teleoperator: the same as of the left hand; allowed: another one for each hand$"
+    )
+    with pytest.raises(ConfigError, match=told):
+        make_input("lerobot", cell("lerobot", left=GAMEPAD, right=GAMEPAD))
+    left, right = ({"teleoperator": {"type": "so101_leader", "port": "/dev/ttyACM0", "id": hand}} for hand in "lr")
+    with pytest.raises(ConfigError, match=r"right.teleoperator.port = /dev/ttyACM0: the same as of the left hand"):
+        make_input("lerobot", cell("lerobot", left=left, right=right))
+    make_input("lerobot", cell("lerobot", left=left, right=GAMEPAD))
+
+
 def test_the_control_grip_is_a_dead_mans_switch_whatever_the_bindings_of_the_cell_say(cell: Cell) -> None:
     bindings = adapted("lerobot", cell("lerobot", right=GAMEPAD)).teleop.bindings
     assert {binding.control: binding.action for binding in bindings.bound()} == {
