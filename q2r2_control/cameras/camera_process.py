@@ -15,7 +15,7 @@ import numpy.typing as npt
 from q2r2_control.cameras.device import CameraDevice, DepthCapture, Pixels
 from q2r2_control.cameras.opening import open_device
 from q2r2_control.config.recording import CameraConfig
-from q2r2_control.errors import CameraError
+from q2r2_control.process.helper_process import reason_of
 
 # Niceness of a camera's process. At this niceness, the loop has priority even over ten of these processes together.
 # On a computer that is too busy, this process may therefore receive a picture late. If the picture has no stamp of the
@@ -86,9 +86,10 @@ def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
     while True:
         try:
             _pass_on(device, camera, answer)
-        except CameraError as error:
-            answer(CameraLost(str(error)))
-        device.close()
+        except Exception as error:  # Libraries of cameras raise exceptions of their own if a camera is unplugged.
+            answer(CameraLost(reason_of(error)))
+        with suppress(Exception):  # Closing an unplugged camera can raise an exception.
+            device.close()
         if camera.device_kind == "file":
             # A video that has ended does not begin again, so this process only waits until the run ends.
             threading.Event().wait()
@@ -117,7 +118,7 @@ def _pass_on(device: CameraDevice, camera: CameraConfig, answer: Callable[[Answe
 def _opened_anew(camera: CameraConfig) -> CameraDevice:
     while True:
         time.sleep(_RETRY)
-        with suppress(CameraError):
+        with suppress(Exception):
             return open_device(camera)
 
 

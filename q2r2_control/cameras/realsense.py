@@ -6,6 +6,7 @@ import importlib.util
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -121,9 +122,11 @@ class RealSense:
         return Capture(captured, pixels)
 
     def close(self) -> None:
+        """See :meth:`CameraDevice.close`. A sensor that is gone does not prevent that the others are freed."""
         for sensor in self._sensors:
-            sensor.stop()
-            sensor.close()
+            for free in (sensor.stop, sensor.close):
+                with suppress(RuntimeError):
+                    free()
 
     def _choose(self, device: Any, stream: Any) -> tuple[Any, Any]:
         """Return the sensor and the profile of a stream whose size and rate fit the cell best."""

@@ -231,9 +231,13 @@ class Pipeline(RequestedRun):
         if isinstance(self.plant, SessionPlant):
             raise ConfigError("ticks one by one: allowed with a plant that is simulated only")
         self._pace = None
-        self._prepare(realtime=False)
-        self._start_input(realtime=False)
-        self._begin(realtime=False, counts=False)
+        try:
+            self._prepare(realtime=False)
+            self._start_input(realtime=False)
+            self._begin(realtime=False, counts=False)
+        except BaseException:  # The caller has no run that it could end.
+            self.end()
+            raise
 
     def tick_until(self, end: float) -> None:
         """Take the ticks of a run that has begun, up to the last one at or before ``end`` [s] of the loop's clock.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from q2r2_devices.leader import LeaderArm, LeaderSettings, trigger_of
 
-from q2r2_control import ConfigError
+from q2r2_control import ConfigError, InputError
 from tests.devices.leader_arm import JOINTS, place, write_urdf
 
 NAMES = [*(f"{joint}.pos" for joint in JOINTS), "gripper.pos"]
@@ -74,6 +74,18 @@ def test_a_roll_of_the_wrist_turns_the_tool(tmp_path: Path) -> None:
             "leader.joints.a = free: not such a joint",
             id="a joint without an angle",
         ),
+        pytest.param(
+            NAMES,
+            {"joints": {"shoulder_pam": "shoulder_pan"}},
+            "leader.joints.shoulder_pam: not such a joint of the teleoperator; allowed: shoulder_pan, shoulder_lift",
+            id="a name that the teleoperator does not have",
+        ),
+        pytest.param(
+            NAMES,
+            {"joints": {"elbow_flex": "wrist_flex"}},
+            "leader.joints.elbow_flex: two joints move the same joint of the URDF; allowed: one",
+            id="two joints that are the same joint of the URDF",
+        ),
         pytest.param(["delta_x"], {}, "leader: the teleoperator gives delta_x; allowed: positions", id="no leader"),
     ],
 )
@@ -96,3 +108,14 @@ def test_a_joint_without_limits_is_refused_unless_its_position_is_in_degrees(tmp
 def test_a_closed_handle_is_a_pressed_trigger(gripper: float, trigger: float) -> None:
     assert trigger_of({"gripper.pos": gripper}) == trigger
     assert trigger_of({}) == 0.0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_position_that_is_no_finite_number_is_refused_with_the_name_of_its_joint(
+    tmp_path: Path, value: float
+) -> None:
+    leader = arm(tmp_path)
+    with pytest.raises(InputError, match=rf"^elbow_flex.pos = {value}: allowed: a finite number$"):
+        leader.tool(AT_ZERO | {"elbow_flex.pos": value})
+    with pytest.raises(InputError, match=rf"^gripper.pos = {value}: allowed: a finite number$"):
+        trigger_of({"gripper.pos": value})

@@ -50,6 +50,18 @@ def test_a_pedal_is_held_from_its_press_to_its_release(pedal: tuple[Pedal, int])
     os.close(writer)
 
 
+def test_a_pedal_whose_release_the_kernel_may_have_dropped_is_not_held_until_its_key_is_pressed_or_repeats(
+    pedal: tuple[Pedal, int],
+) -> None:
+    device, writer = pedal
+    os.write(writer, events((KEY_B, DOWN)))
+    assert device.read() is True
+    os.write(writer, struct.pack("@llHHi", 1700000000, 123456, 0, 3, 0))  # EV_SYN, SYN_DROPPED
+    assert device.read() is False
+    os.write(writer, events((KEY_B, REPEAT)))
+    assert device.read() is True
+
+
 def test_reading_a_pedal_that_was_removed_raises_an_error(pedal: tuple[Pedal, int]) -> None:
     device, writer = pedal
     os.write(writer, events((KEY_B, DOWN)))

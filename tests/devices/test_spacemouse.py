@@ -215,6 +215,20 @@ def test_each_hand_has_its_own_mouse(cell: Cell, plugged: Callable[..., None]) -
             "right: device = B9: is not there; connected now: /dev/hidraw3 or S",
             id="another one",
         ),
+        pytest.param(
+            ("/dev/hidraw3",),
+            {"left": {}, "right": {}},
+            "right: device = null: /dev/hidraw3 moves the other hand; allowed: the path or serial number of another "
+            "SpaceMouse; connected now: /dev/hidraw3 or S",
+            id="one for two hands",
+        ),
+        pytest.param(
+            ("/dev/hidraw3",),
+            {"left": {"device": "/dev/hidraw3"}, "right": {"device": "S"}},
+            "right: device = S: /dev/hidraw3 moves the other hand; allowed: the path or serial number of another "
+            "SpaceMouse; connected now: /dev/hidraw3 or S",
+            id="the path and the serial number of the same mouse",
+        ),
     ],
 )
 def test_if_the_mouse_of_a_hand_is_missing_the_start_fails_with_one_line_and_all_other_mice_are_closed(

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from q2r2_devices import reading, teleoperators
 from q2r2_devices.rate import SILENCE, RateHand, RateReading
 
-from q2r2_control import Config, ConfigError, HandInputs, InputError
+from q2r2_control import Config, ConfigError, HandInputs, HandSample, InputError
 from q2r2_control.config.yaml_text import read_yaml
 from q2r2_control.inputs import adapted, make_input
+from tests.devices.mice import until
 from tests.support.modules import blocks_of
 
 Cell = Callable[..., Config]
@@ -35,12 +39,68 @@ def test_a_cell_without_a_hand_or_with_a_wrong_setting_is_refused(cell: Cell) ->
         make_input("lerobot", cell("lerobot", right={}))
 
 
+def test_one_teleoperator_for_both_hands_is_refused(cell: Cell) -> None:
+    told = (
+        r"^input_settings.lerobot.right.teleoperator: the same as of the left hand; allowed: another one for each hand$"
+    )
+    with pytest.raises(ConfigError, match=told):
+        make_input("lerobot", cell("lerobot", left=GAMEPAD, right=GAMEPAD))
+    left, right = ({"teleoperator": {"type": "so101_leader", "port": "/dev/ttyACM0", "id": hand}} for hand in "lr")
+    with pytest.raises(ConfigError, match=r"right.teleoperator.port = /dev/ttyACM0: the same as of the left hand"):
+        make_input("lerobot", cell("lerobot", left=left, right=right))
+    make_input("lerobot", cell("lerobot", left=left, right=GAMEPAD))
+
+
 def test_the_control_grip_is_a_dead_mans_switch_whatever_the_bindings_of_the_cell_say(cell: Cell) -> None:
     bindings = adapted("lerobot", cell("lerobot", right=GAMEPAD)).teleop.bindings
     assert {binding.control: binding.action for binding in bindings.bound()} == {
         "trigger": "gripper_analog",
         "grip": "dead_man",
     }
+
+
+class Gamepad:
+    """A teleoperator with the methods of lerobot's gamepad. Its action is ``action``."""
+
+    name, is_connected = "gamepad", True
+    action_features: ClassVar = {"names": {"delta_x": 0, "delta_y": 1, "delta_z": 2, "gripper": 3}}
+
+    def __init__(self) -> None:
+        self.action: dict[str, float] = {"delta_x": 1.0, "delta_y": 0.0, "delta_z": 0.0, "gripper": 1}
+
+    def connect(self) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def get_action(self) -> dict[str, float]:
+        return self.action
+
+    def get_teleop_events(self) -> dict[Any, bool]:
+        return {}
+
+
+def test_a_gamepad_that_sends_nan_is_lost_and_its_hand_moves_on_from_the_same_place(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "_RETRY", 0.001)
+    gamepad, lines = Gamepad(), list[str]()
+    monkeypatch.setattr(teleoperators, "_made", lambda settings: gamepad)
+    source = make_input("lerobot", cell("lerobot", right=GAMEPAD), say=lines.append)
+    source.start()
+
+    def samples() -> list[HandSample]:
+        return source.poll(time.monotonic())
+
+    until(lambda: bool(samples()))
+    gamepad.action = gamepad.action | {"delta_y": np.nan}
+    until(lambda: len(lines) > 1)
+    assert lines[1].startswith("input_settings.lerobot.right: lost, delta_y = nan: allowed: a finite number; it is")
+    samples()
+    gamepad.action = gamepad.action | {"delta_y": 0.0}
+    found: list[HandSample] = []
+    until(lambda: bool(found.extend(samples()) or found))
+    assert np.isfinite(found[-1].position).all()
+    source.close()
 
 
 FAST = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.5])
@@ -78,6 +138,19 @@ def test_after_a_gap_between_two_polls_the_hand_moves_for_at_most_a_tenth_of_a_s
     hand.poll([RateReading(FAST, HandInputs())], 0.0)
     (sample,) = hand.poll([RateReading(FAST, HandInputs())], 0.14)
     np.testing.assert_allclose(sample.position, (0.01, 0.0, 0.0), atol=1e-12)
+
+
+def test_a_hand_that_was_lost_has_samples_again_in_a_run_whose_clock_begins_anew() -> None:
+    hand, rests = RateHand("left"), RateReading(np.zeros(6), HandInputs())
+    assert hand.poll([rests], 1000.0)
+    assert hand.poll([None, rests], 0.0)
+
+
+def test_a_hand_does_not_move_back_if_the_clock_goes_back() -> None:
+    hand = RateHand("left")
+    hand.poll([RateReading(FAST, HandInputs())], 5.0)
+    (sample,) = hand.poll([None, RateReading(FAST, HandInputs())], 4.0)
+    np.testing.assert_array_equal(sample.position, np.zeros(3))
 
 
 def test_the_settings_in_the_docs_are_accepted(cell: Cell) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from q2r2_franka import limits, stream
-from q2r2_franka.check import Checked, check_commands
+from q2r2_franka.check import Checked, check_commands, main
 from q2r2_franka.limits import JOINTS, PERIOD
 from q2r2_franka.record import Entry, entries_of, write_entry
 from q2r2_franka.stream import PositionStream, TorqueStream
@@ -161,6 +161,29 @@ def test_torques_change_no_faster_than_the_robot_allows_even_if_the_robot_drops_
     assert result.shares["torque rate"] == pytest.approx(1.0, abs=2e-3)
     raw = [Entry(0, False, True, 1, 0.0, tau, held) for tau, held in zip(wanted[1:], wanted, strict=False)]
     assert checked(raw).violated == ["torque", "torque rate"]
+
+
+def test_a_command_that_is_no_number_violates_the_limits() -> None:
+    path = np.tile(MIDDLE, (5, 1))
+    path[3, 2] = np.nan
+    assert "position" in checked(positions_in_time(list(path))).violated
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(b"", id="an empty file"),
+        pytest.param(b"a text", id="a file that is shorter than an entry"),
+        pytest.param(bytes(1000), id="a file without the beginning of a motion"),
+        pytest.param(b"\xff" * 1000, id="a file with an arm that does not exist"),
+    ],
+)
+def test_a_file_without_commands_does_not_pass_the_check(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (file := tmp_path / "commands.bin").write_bytes(content)
+    assert main([str(file)]) == 2
+    assert capsys.readouterr().err == f"{file}: no commands; allowed: a file of plant_settings.franka.record\n"
 
 
 def test_a_velocity_near_a_position_limit_is_checked_against_the_smaller_velocity_limit_there() -> None:

@@ -12,7 +12,7 @@ from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ContactPair
 from q2r2_control.control.qp import QpProblem, QpSolution
 from q2r2_control.control.solvers.daqp import DaqpSolver
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -270,6 +270,20 @@ def test_ticks_that_a_program_takes_one_by_one_equal_the_ticks_of_a_run() -> Non
     loop.end()
     assert np.ptp(stepped, axis=0).max() > 0.01
     np.testing.assert_array_equal(stepped, ran)
+
+
+def test_an_input_is_closed_if_single_ticks_cannot_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop, calls = pipeline(), list[str]()
+    monkeypatch.setattr(loop.input, "start", lambda: calls.append("start"))
+    monkeypatch.setattr(loop.input, "close", lambda: calls.append("close"))
+
+    def refuse(q: object = None) -> None:
+        raise PlantError("no plant")
+
+    monkeypatch.setattr(loop.plant, "reset", refuse)
+    with pytest.raises(PlantError, match="no plant"):
+        loop.begin()
+    assert calls == ["start", "close"]
 
 
 def test_single_ticks_are_refused_with_real_arms_because_nothing_would_brake_the_arms() -> None:

@@ -9,7 +9,7 @@ from enum import StrEnum
 import pinocchio as pin
 from pydantic import Field
 
-from q2r2_control import Array, ConfigError, StrictModel
+from q2r2_control import Array, ConfigError, InputError, StrictModel
 
 POSITION = ".pos"  # lerobot's suffix of a joint's position in an action.
 GRIPPER = f"gripper{POSITION}"  # 0 closed .. 100 open.
@@ -61,6 +61,15 @@ class LeaderArm:
                 f"leader: the teleoperator gives {', '.join(names)}; allowed: positions of joints, NAME.pos"
             )
         self._joints = {name: self._joint(name.removesuffix(POSITION)) for name in moving}
+        given = [name.removesuffix(POSITION) for name in moving]
+        if unknown := [name for name in settings.joints if name not in given]:
+            raise ConfigError(
+                f"leader.joints.{unknown[0]}: not such a joint of the teleoperator; allowed: {', '.join(given)}"
+            )
+        places = [at for at, _ in self._joints.values()]
+        for name, at in zip(given, places, strict=True):
+            if places.count(at) > 1:
+                raise ConfigError(f"leader.joints.{name}: two joints move the same joint of the URDF; allowed: one")
 
     def _joint(self, name: str) -> tuple[int, float]:
         """Return the index in q of the joint that lerobot calls ``name``, and its direction."""
@@ -83,10 +92,11 @@ class LeaderArm:
 
         Raises:
             KeyError: If a joint is missing in the ``action``.
+            InputError: If its position is not a finite number.
         """
         q = pin.neutral(self._model)
         for name, (at, direction) in self._joints.items():
-            value = direction * float(action[name])
+            value = direction * number_of(action, name)
             if self._settings.units is Units.DEGREES:
                 q[at] = math.radians(value)
             else:
@@ -98,5 +108,22 @@ class LeaderArm:
 
 
 def trigger_of(action: Mapping[str, float]) -> float:
-    """Return how far the gripper's handle is pressed, from 0 for open to 1 for closed; 0 if there is no handle."""
-    return min(max(1.0 - float(action.get(GRIPPER, 100.0)) / 100.0, 0.0), 1.0)
+    """Return how far the gripper's handle is pressed, from 0 for open to 1 for closed; 0 if there is no handle.
+
+    Raises:
+        InputError: If the position of the handle is not a finite number.
+    """
+    opening = number_of(action, GRIPPER) if GRIPPER in action else 100.0
+    return min(max(1.0 - opening / 100.0, 0.0), 1.0)
+
+
+def number_of(action: Mapping[str, float], name: str) -> float:
+    """Return a number of a teleoperator's action.
+
+    Raises:
+        KeyError: If it is missing.
+        InputError: If it is not a finite number.
+    """
+    if not math.isfinite(number := float(action[name])):
+        raise InputError(f"{name} = {number}: allowed: a finite number")
+    return number

@@ -11,6 +11,7 @@ from q2r2_devices.reading import READ_TIMEOUT
 
 # struct input_event of Linux (Documentation/input/input.rst): the time in two longs, then type, code and value.
 _EVENT = struct.Struct("@llHHi")
+_SYN, _DROPPED = 0, 3  # EV_SYN and SYN_DROPPED: the reader was too slow, and the kernel has dropped events.
 _KEY = 1  # EV_KEY. Its value is 0 for released, 1 for pressed, and 2 for the repetitions while a key is held.
 
 
@@ -41,7 +42,9 @@ class Pedal:
         if not events:
             raise EOFError(f"{self._path} has ended")
         for _, _, kind, code, value in _EVENT.iter_unpack(events):
-            if kind == _KEY and value:
+            if (kind, code) == (_SYN, _DROPPED):
+                self._held.clear()  # A release may be among the dropped events. A held key repeats itself.
+            elif kind == _KEY and value:
                 self._held.add(code)
             elif kind == _KEY:
                 self._held.discard(code)

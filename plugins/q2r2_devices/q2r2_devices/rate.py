@@ -48,6 +48,8 @@ class RateHand:
         samples = []
         for reading in readings:
             before, self._reading, self._heard = self._reading, reading, now
+            if reading is None:
+                self._next = -np.inf  # The device may be lost because a run has ended. The next run has another clock.
             # Each change of a control has a sample of its own, so that a short tap is not lost.
             if before is not None and reading is not None and before.inputs != reading.inputs:
                 samples.append(self._sample(reading.inputs, now))
@@ -60,7 +62,7 @@ class RateHand:
         return self._reading is not None and bool(self._reading.velocity.any()) and now - self._heard > SILENCE
 
     def _integrate(self, now: float) -> None:
-        dt, self._last = min(now - self._last, _LONGEST_STEP), now
+        dt, self._last = min(max(now - self._last, 0.0), _LONGEST_STEP), now
         if self._reading is None or self._is_silent(now):
             return
         linear, angular = np.split(self._reading.velocity * dt, 2)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import struct
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -96,10 +97,15 @@ class Reports:
 
 
 class SpaceMouse:
-    """A SpaceMouse, as a :class:`~q2r2_devices.reading.Device`."""
+    """A SpaceMouse, as a :class:`~q2r2_devices.reading.Device`.
 
-    def __init__(self, settings: MouseSettings) -> None:
-        self._settings = settings
+    Args:
+        settings: The settings of the hand.
+        users: The SpaceMouse that uses each path. All hands share it, because one device must not move two arms.
+    """
+
+    def __init__(self, settings: MouseSettings, users: dict[str, SpaceMouse]) -> None:
+        self._settings, self._users = settings, users
         self._device: Any = None
 
     def open(self) -> str:
@@ -109,14 +115,18 @@ class SpaceMouse:
         fit = [info for info in found.values() if wanted is None or wanted in _names(info)]
         fit = fit or [info for info in found.values() if os.path.realpath(str(wanted)) in _names(info)]
         if len(fit) != 1:
-            there = ", ".join(" or ".join(_names(info)) for info in found.values()) or "none"
             problem = "several devices fit" if fit else "is not there" if wanted else "no SpaceMouse is there"
-            raise InputError(f"device = {wanted or 'null'}: {problem}; connected now: {there}")
+            raise InputError(f"device = {wanted or 'null'}: {problem}; connected now: {_listed(found.values())}")
         path = fit[0]["path"].decode()
         if os.path.exists(path) and not os.access(path, os.R_OK | os.W_OK):
             rule = f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{fit[0]["vendor_id"]:04x}", TAG+="uaccess"'
             cure = f"as root, write {rule} to /etc/udev/rules.d/70-spacemouse.rules, and plug the SpaceMouse in again"
             raise InputError(f"no permission to read {path}; {cure}")
+        if self._users.setdefault(path, self) is not self:
+            raise InputError(
+                f"device = {wanted or 'null'}: {path} moves the other hand; allowed: the path or serial number of "
+                f"another SpaceMouse; connected now: {_listed(found.values())}"
+            )
         self._device = hid.device()
         self._device.open_path(fit[0]["path"])
         self._reports = Reports(self._settings)
@@ -126,8 +136,14 @@ class SpaceMouse:
         return self._reports.take(bytes(self._device.read(64, round(1000 * READ_TIMEOUT))))
 
     def close(self) -> None:
+        for path in [path for path, user in self._users.items() if user is self]:
+            del self._users[path]
         if self._device is not None:
             self._device.close()
+
+
+def _listed(found: Iterable[dict[str, Any]]) -> str:
+    return ", ".join(" or ".join(_names(info)) for info in found) or "none"
 
 
 def _names(info: dict[str, Any]) -> list[str]:
@@ -164,7 +180,9 @@ class SpaceMouseInput(DeviceInput):
         if not given:
             raise ConfigError("input_settings.spacemouse: no hand; allowed: a hand, as right: {}")
         where = "input_settings.spacemouse"
-        super().__init__({hand: DeviceReader(f"{where}.{hand}", SpaceMouse(its), say) for hand, its in given.items()})
+        users: dict[str, SpaceMouse] = {}
+        mice_of_hands = {hand: SpaceMouse(its, users) for hand, its in given.items()}
+        super().__init__({hand: DeviceReader(f"{where}.{hand}", its, say) for hand, its in mice_of_hands.items()})
         self._hands = {hand: RateHand(hand) for hand in given}
 
     @classmethod

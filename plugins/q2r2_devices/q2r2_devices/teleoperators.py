@@ -30,7 +30,7 @@ from q2r2_control import (
     InputError,
     StrictModel,
 )
-from q2r2_devices.leader import LeaderArm, LeaderSettings, trigger_of
+from q2r2_devices.leader import LeaderArm, LeaderSettings, number_of, trigger_of
 from q2r2_devices.pedal import Pedal
 from q2r2_devices.rate import RateHand, RateReading
 from q2r2_devices.reading import DeviceInput, DeviceReader, Say, tell
@@ -118,7 +118,7 @@ class Teleoperator:
             return LeaderReading(*self._leader.tool(action), HandInputs(press_index=trigger_of(action)))
         if (gripper := int(action.get("gripper", _STAY))) != _STAY:
             self._trigger = float(gripper == _CLOSE)
-        deltas = np.clip([float(action[name]) for name in _DELTAS], -1.0, 1.0)
+        deltas = np.clip([number_of(action, name) for name in _DELTAS], -1.0, 1.0)
         velocity = np.concatenate([self._settings.speed * deltas, np.zeros(3)])
         return RateReading(velocity, HandInputs(press_index=self._trigger, press_middle=float(held)))
 
@@ -151,6 +151,15 @@ def _made(settings: dict[str, Any]) -> Any:
     return known.make_teleoperator_from_config(draccus.decode(known.TeleoperatorConfig, settings))
 
 
+def _check_different(hands: dict[str, TeleoperatorSettings]) -> None:
+    """Raise :class:`ConfigError` if one teleoperator would move both arms."""
+    left, right = (hands[hand].teleoperator if hand in hands else {} for hand in ("left", "right"))
+    port = right.get("port")
+    if left and (left == right or (port is not None and left.get("port") == port)):
+        what = "teleoperator" if port is None else f"teleoperator.port = {port}"
+        raise ConfigError(f"{_WHERE}.right.{what}: the same as of the left hand; allowed: another one for each hand")
+
+
 class LeaderHand:
     """The hand at a leader arm. It has one sample for each reading."""
 
@@ -177,6 +186,7 @@ class LerobotInput(DeviceInput):
         hands = {hand: its for hand, its in given.items() if its is not None}
         if not hands:
             raise ConfigError(f"{_WHERE}: no hand; allowed: a hand, as right: {{teleoperator: {{type: gamepad}}}}")
+        _check_different(hands)
         has_pedal = settings.pedal is not None
         readers: dict[str, DeviceReader[Any]] = {
             hand: DeviceReader(f"{_WHERE}.{hand}", Teleoperator(its, has_pedal), say) for hand, its in hands.items()

@@ -76,13 +76,23 @@ def main(commands: int, states: int) -> None:
                     stack.enter_context(real_time(priority))
                     reserve(*_RESERVED)
                 stack.enter_context(few_garbage_collections())
-                record = stack.enter_context(open(settings.record, "wb")) if settings.record else None
+                record = stack.enter_context(_opened(settings.record)) if settings.record else None
                 _Answering(from_loop, to_loop, settings, mode, torque_limits, record).run()
         except Exception as error:
             with suppress(OSError):
                 from_loop.send(reason_of(error).encode())
     # The process ends without running destructors, because the library's destructors would wait for lost robots.
     os._exit(0)
+
+
+def _opened(record: str) -> BinaryIO:
+    """Open the file for every command. Raises :class:`PlantError` if this is not possible."""
+    try:
+        return open(record, "wb")
+    except OSError as error:
+        raise PlantError(
+            f"plant_settings.franka.record = {record}: {reason_of(error)}; allowed: a file in a folder that exists"
+        ) from error
 
 
 class _Answering:

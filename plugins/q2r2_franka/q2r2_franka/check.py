@@ -8,6 +8,7 @@ Between two states that were read, the check assumes that the robot moves in thi
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -43,7 +44,9 @@ class Checked:
         return [name for name, share in self.shares.items() if share > 1.0 + _ROUNDING]
 
     def see(self, name: str, share: Array | float) -> None:
-        self.shares[name] = max(self.shares.get(name, 0.0), float(np.max(share)))
+        greatest = float(np.max(share))
+        # A number that is not finite violates every limit. ``max`` alone would ignore NaN.
+        self.shares[name] = max(self.shares.get(name, 0.0), greatest if math.isfinite(greatest) else math.inf)
 
 
 def check_commands(entries: Iterable[Entry]) -> dict[str, Checked]:
@@ -85,11 +88,17 @@ def _check_positions(result: Checked, history: list[Array], newest: Array) -> No
 
 
 def main(arguments: list[str]) -> int:
-    """Print the greatest share of each limit. Return 1 if a limit is violated, 2 if ``arguments`` are wrong, else 0."""
+    """Print the greatest share of each limit. Return 1 for a violation, 2 if nothing can be checked, else 0."""
     if len(arguments) != 1 or not Path(arguments[0]).is_file():
         print("usage: python -m q2r2_franka.check FILE, a file of plant_settings.franka.record", file=sys.stderr)
         return 2
-    checked = check_commands(entries_of(Path(arguments[0])))
+    try:
+        checked = check_commands(entries_of(Path(arguments[0])))
+    except (IndexError, KeyError):  # There is no such arm, or no motion has begun before a command.
+        checked = {}
+    if not any(its.commands for its in checked.values()):
+        print(f"{arguments[0]}: no commands; allowed: a file of plant_settings.franka.record", file=sys.stderr)
+        return 2
     for arm, its in checked.items():
         shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in its.shares.items())
         print(f"{arm}: {its.commands} commands, {its.motions} motions, {its.lost} periods without a command")

@@ -20,7 +20,8 @@ from q2r2_franka.limits import PERIOD
 from q2r2_franka.settings import FrankaArmSettings, LoadSettings
 from q2r2_franka.state import Measured, Mode
 
-ERRORS = (RuntimeError, pylibfranka.FrankaException)
+# The library raises ValueError for a command that is not finite.
+ERRORS = (RuntimeError, ValueError, pylibfranka.FrankaException)
 _FILES = "/proc/self/fd"
 # The robot's own controller of joint positions. Settings in Desk may let this controller filter the commands. Its
 # stiffness is not changed here.
