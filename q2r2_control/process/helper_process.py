@@ -51,7 +51,8 @@ class HelperProcess:
         Args:
             module: Name of the module.
             what: What the process does, for messages about faults.
-            on_answer: A function that gets each answer. It is called in a separate thread.
+            on_answer: A function that gets each answer. It is called in a separate thread. If it raises an exception,
+                the process is ended, and :attr:`fault` says why.
             room: Largest size of all requests that wait [bytes].
             idle: If no request comes for this time, the process gets None as a request [s].
             environment: Environment variables of the process. Variables of this process override them.
@@ -122,12 +123,15 @@ class HelperProcess:
         would also keep its output pipe open. The end of this pipe shows that the process has ended.
         """
         self._killed = True
+        self._end_group()
+        self._queue.put(None)
+        self._listener.join(_AFTER_KILL)
+
+    def _end_group(self) -> None:
         # If the return code is set, the process has ended. The system may have given its ID to another process.
         if self._process.returncode is None:
             with suppress(OSError):  # The call fails if the process group has already ended.
                 os.killpg(self.pid, signal.SIGKILL)
-        self._queue.put(None)
-        self._listener.join(_AFTER_KILL)
 
     def _is_ready_to_run(self) -> bool:
         """Return whether at least one thread of the process runs or is ready to run. Only Linux tells this."""
@@ -162,15 +166,21 @@ class HelperProcess:
             while fault is None:
                 answer = pickle.load(stream)
                 self._moved = time.monotonic()
-                if isinstance(answer, RuntimeError):
-                    fault = str(answer)
-                else:
-                    self._on_answer(answer)
+                fault = str(answer) if isinstance(answer, RuntimeError) else self._pass_on(answer)
         code = self._process.wait()
         stream.close()
         if fault is None and not self._killed and (code or not self._ending):
             fault = how_it_ended(f"the process that {self._what}", code)
         self.fault = self.fault or fault
+
+    def _pass_on(self, answer: Any) -> str | None:
+        """Pass an answer on. If this fails, end the process, and return the reason; otherwise return None."""
+        try:
+            self._on_answer(answer)
+        except Exception as error:
+            self._end_group()
+            return f"an answer of the process that {self._what} was refused: {reason_of(error)}"
+        return None
 
 
 def start_python(

@@ -17,3 +17,17 @@ def test_a_process_that_does_not_end_is_killed_with_its_children(busy: bool, fau
     process.finish(patience=60.0 if busy else 0.5, longest=0.5 if busy else 60.0)
     assert process.fault == f"the process that lasts {fault}"
     wait_until(lambda: not alive(started[0]) and not process.alive)
+
+
+def test_a_process_whose_answer_cannot_be_used_is_ended_with_its_children_and_the_fault_says_why() -> None:
+    started: list[int] = []
+
+    def refuse(child: int) -> None:
+        started.append(child)
+        raise ValueError("the page\nis closed")
+
+    process = HelperProcess("lasts", "tests.support.lasting_helper", refuse)
+    process.send(False)
+    wait_until(lambda: not process.alive)
+    assert process.fault == "an answer of the process that lasts was refused: the page is closed"
+    wait_until(lambda: not alive(started[0]))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import signal
 
 import pytest
 from PIL import Image
@@ -36,14 +38,28 @@ def test_pictures_of_a_simulated_camera_are_shown_and_one_line_says_if_the_proce
             return bool(got)
 
         wait_until(taken)
-        pictures._process.kill()
+        os.kill(pictures._process.pid, signal.SIGKILL)
         wait_until(lambda: not pictures._process.alive)
         pictures._due = 0.0
         for _ in range(3):
             pictures(tick)
     loop.end()
     assert Image.open(io.BytesIO(got[0])).size == (64, 48)
-    assert len([record for record in caplog.records if "no more pictures are shown" in record.message]) == 1
+    told = [record.message for record in caplog.records if "no more pictures are shown" in record.message]
+    assert told == ["no more pictures are shown: the process that takes pictures was ended by SIGKILL"]
+
+
+@pytest.mark.slow
+def test_no_line_says_that_pictures_have_ended_if_their_run_has_ended(caplog: pytest.LogCaptureFixture) -> None:
+    camera = CameraConfig(position=(1.5, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48)
+    loop = Pipeline.from_config(cell().model_copy(update={"cameras": {"front": camera}}), plant="mujoco")
+    assert isinstance(loop.plant, MujocoPlant)
+    with LivePictures(loop.plant, "front", camera, 30.0, lambda jpeg: None, lambda: True) as pictures:
+        loop.begin()
+        tick = loop.tick()
+    pictures(tick)
+    loop.end()
+    assert "no more pictures" not in caplog.text
 
 
 def test_pictures_of_a_real_camera_are_shown_at_the_wanted_rate_and_only_while_somebody_watches() -> None:
