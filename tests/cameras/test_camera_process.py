@@ -34,7 +34,9 @@ def requests() -> Iterator[CameraConfig]:
 def test_a_camera_whose_library_raises_exceptions_of_its_own_is_lost_and_opened_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    tries = iter([Unplugged(), RuntimeError("no such device"), Unplugged(), KeyboardInterrupt()])
+    tries: Iterator[Unplugged | BaseException] = iter(
+        [Unplugged(), RuntimeError("no such device"), Unplugged(), KeyboardInterrupt()]
+    )
 
     def opened(camera: CameraConfig) -> Unplugged:
         found = next(tries)

@@ -72,8 +72,7 @@ def test_a_device_that_does_not_answer_is_lost_and_counts_again_when_it_answers(
     device, lines = Silent(), list[str]()
     reader = DeviceReader("left", device, lines.append)
     reader.start()
-    until(lambda: reader.take()[-1:] == [1])
-    assert reader.connected
+    until(lambda: reader.take()[-1:] == [1] and reader.connected)
     until(lambda: reader.take() == [None])
     assert not reader.connected
     assert lines[1:] == ["left: lost, no answer for 1 s; it counts again as soon as it answers"]

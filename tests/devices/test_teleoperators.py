@@ -98,7 +98,12 @@ def test_a_gamepad_that_sends_nan_is_lost_and_its_hand_moves_on_from_the_same_pl
     samples()
     gamepad.action = gamepad.action | {"delta_y": 0.0}
     found: list[HandSample] = []
-    until(lambda: bool(found.extend(samples()) or found))
+
+    def moves() -> bool:
+        found.extend(samples())
+        return bool(found)
+
+    until(moves)
     assert np.isfinite(found[-1].position).all()
     source.close()
 
