@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -78,12 +79,17 @@ class Cluster:
     @contextmanager
     def _client(self) -> Iterator[Any]:
         where = {"scheduler_file": self._address} if os.path.isfile(self._address) else {"address": self._address}
-        try:
+        client = None
+        with suppress(OSError, ValueError, TypeError, KeyError, AssertionError):
             client = self._distributed.Client(**where, timeout=_CONNECT_S, set_as_default=False)
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        if client is None:
+            # The exception of dask is not kept, because its traceback keeps the client that could not connect. Such a
+            # client closes itself when it is deleted. If this is at the end of the program, when dask's thread has
+            # ended, it waits for 40 s and prints a traceback.
+            gc.collect()
             raise self._error(
                 "no scheduler answers there; allowed: its address, such as tcp://node01:8786, or its file"
-            ) from error
+            )
         with client:
             yield client
 

@@ -217,3 +217,16 @@ def test_dask_is_imported_only_for_a_cluster() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "Move arms" in done.stdout
     assert done.stderr.splitlines()[-1] == "set()"
+
+
+@pytest.mark.slow
+def test_an_address_without_a_scheduler_and_another_file_end_a_program_with_one_line_only(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    (file := tmp_path / "notes.txt").write_text("no scheduler")
+    for address in ("nonsense", str(file)):
+        options = ["--seeds", "1", "--ticks", "100", "--cluster", address]
+        command = [sys.executable, "-m", "q2r2_control", "soak", *options]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        told = "no scheduler answers there; allowed: its address, such as tcp://node01:8786, or its file"
+        assert done.stderr.strip() == f"q2r2: --cluster {address}: {told}"
