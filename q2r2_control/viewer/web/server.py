@@ -15,6 +15,7 @@ import viser
 from q2r2_control.viewer.web.door import Door
 from q2r2_control.viewer.web.driving import Driving
 from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageSetup, PageWatched, Ready
+from q2r2_control.viewer.web.message_buffer import use_message_buffer
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
@@ -85,6 +86,7 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     with suppress(OSError):
         os.nice(_NICENESS)
     door, newest = Door(setup.host, setup.port, setup.certificate, setup.addresses), _Newest()
+    use_message_buffer()
     with door.guards(setup.config.name):
         server = viser.ViserServer(host=setup.host, port=door.port, verbose=False)
     open_pages: set[int] = set()

@@ -1,0 +1,37 @@
+"""The thread that draws a page writes messages while the server's thread waits for them."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import deque
+
+from q2r2_control.viewer.web.message_buffer import LoopEvent
+
+
+class Guarded(deque[object]):
+    """The waiters of an event. Only the thread that made them may go through them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._owner = threading.get_ident()
+
+    def __iter__(self):  # type: ignore[no-untyped-def]
+        assert threading.get_ident() == self._owner, "another thread goes through the waiters of the loop"
+        return super().__iter__()
+
+
+def test_another_thread_marks_the_event_and_only_the_loop_wakes_its_waiters() -> None:
+    async def wait() -> list[bool]:
+        event = LoopEvent()
+        event._waiters = Guarded()  # type: ignore[assignment]
+        waiter = asyncio.ensure_future(event.wait())
+        await asyncio.sleep(0)
+        thread = threading.Thread(target=event.set)
+        thread.start()
+        thread.join()
+        marked = [event.is_set(), waiter.done()]
+        event.set()
+        return [*marked, await asyncio.wait_for(waiter, 60.0)]
+
+    assert asyncio.run(wait()) == [True, False, True]
