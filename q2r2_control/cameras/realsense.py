@@ -122,7 +122,7 @@ class RealSense:
         return Capture(captured, pixels)
 
     def close(self) -> None:
-        """See :meth:`CameraDevice.close`. A sensor that is gone does not prevent that the others are freed."""
+        """See :meth:`CameraDevice.close`. If a sensor is gone, the other sensors are closed all the same."""
         for sensor in self._sensors:
             for free in (sensor.stop, sensor.close):
                 with suppress(RuntimeError):

@@ -1,4 +1,7 @@
-"""Check the settings that a cell has for installed inputs and plants, each by the model that its class names."""
+"""Check a cell's settings for inputs and plants of other packages.
+
+The class of an input or a plant names the model of its settings by its attribute ``settings``.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from q2r2_control.plugins import load_class, names_of
 
 
 def check_block(key: str, name: str, found: Any, blocks: Mapping[str, object]) -> None:
-    """Check one block of settings.
+    """Check the settings of one input or plant.
 
     Args:
         key: The key of all blocks in the cell, such as ``plant_settings``.
@@ -30,7 +33,7 @@ def check_blocks(group: str, key: str, blocks: Mapping[str, object]) -> list[str
     """Check all blocks of a ``group`` of entry points as :func:`check_block` does.
 
     Returns:
-        A line for each block that is for nothing installed.
+        A line for each block whose input or plant is not installed.
 
     Raises:
         ConfigError: If a value is not allowed, or if a class cannot be imported.

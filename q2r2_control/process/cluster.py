@@ -83,9 +83,9 @@ class Cluster:
         with suppress(OSError, ValueError, TypeError, KeyError, AssertionError):
             client = self._distributed.Client(**where, timeout=_CONNECT_S, set_as_default=False)
         if client is None:
-            # The exception of dask is not kept, because its traceback keeps the client that could not connect. Such a
-            # client closes itself when it is deleted. If this is at the end of the program, when dask's thread has
-            # ended, it waits for 40 s and prints a traceback.
+            # The client that could not connect has to be deleted now, because it closes itself when it is deleted. At
+            # the end of the program, dask's thread would have ended: the client would wait for 40 s and print a
+            # traceback. dask's exception would keep the client alive, so the exception is not kept as a cause.
             gc.collect()
             raise self._error(
                 "no scheduler answers there; allowed: its address, such as tcp://node01:8786, or its file"

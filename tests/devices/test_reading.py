@@ -1,6 +1,6 @@
 """The thread of a device goes on after a few failed reads, and can be started again after it was closed.
 
-A device that never answers is lost, and ends neither the loop nor the program.
+A device that never answers counts as lost. It delays neither the loop nor the end of the program.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def test_the_control_grip_is_a_dead_mans_switch_whatever_the_bindings_of_the_cel
 
 
 class Gamepad:
-    """A teleoperator with the methods of lerobot's gamepad. Its action is ``action``."""
+    """A teleoperator with the methods of lerobot's gamepad. ``get_action`` returns the attribute ``action``."""
 
     name, is_connected = "gamepad", True
     action_features: ClassVar = {"names": {"delta_x": 0, "delta_y": 1, "delta_z": 2, "gripper": 3}}

@@ -33,7 +33,7 @@ def test_the_error_for_a_record_that_cannot_be_written_names_the_setting_and_the
 
 
 class Refusing:
-    """The connection to a robot whose library refuses every command, as it refuses one that is not finite."""
+    """The connection to a robot. Its library refuses all commands, as the real one refuses NaN."""
 
     is_open, file = True, -1
 

@@ -183,7 +183,9 @@ def test_a_file_without_commands_does_not_pass_the_check(
 ) -> None:
     (file := tmp_path / "commands.bin").write_bytes(content)
     assert main([str(file)]) == 2
-    assert capsys.readouterr().err == f"{file}: no commands; allowed: a file of plant_settings.franka.record\n"
+    assert capsys.readouterr().err == (
+        f"{file}: no commands, or an entry that cannot be read; allowed: a file of plant_settings.franka.record\n"
+    )
 
 
 def test_a_velocity_near_a_position_limit_is_checked_against_the_smaller_velocity_limit_there() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
@@ -12,6 +14,11 @@ from q2r2_control.supervision.joint_watch import watch_settings
 CONFIG = "config/dual_iiwa7.yaml"
 # With these settings, a state that is not finite is a fault at once.
 STRICT = watch_settings(SupervisionSettings(unusable_time=0.0), yields=False)
+
+
+def raised(pose: pin.SE3, by: float) -> pin.SE3:
+    """Return the pose moved up ``by`` [m]."""
+    return pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, by]))
 
 
 def unhurried(config: Config) -> ControllerSettings:

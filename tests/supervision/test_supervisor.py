@@ -10,16 +10,14 @@ import pytest
 
 from q2r2_control import CartesianController, Robot
 from q2r2_control.events import CommonReason, Reason
-from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Supervisor
-from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
+from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, RobotState
 from q2r2_control.wording import sentence
-from tests.supervision.conftest import STRICT
+from tests.supervision.conftest import STRICT, raised
 from tests.support.reasons import kinds
 
 DT = 0.004
-TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.2, 0.4]))
 
 
 class World:
@@ -83,10 +81,6 @@ class World:
 @pytest.fixture
 def world(robot: Robot, controller: CartesianController) -> World:
     return World(robot, controller)
-
-
-def raised(pose: pin.SE3, by: float) -> pin.SE3:
-    return pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, by]))
 
 
 def test_nothing_is_commanded_before_joint_states_are_valid_and_the_arms_rest(world: World, robot: Robot) -> None:
@@ -274,55 +268,11 @@ def test_homing_ends_at_home_and_targets_do_not_change_its_path(world: World) ->
     assert world.supervisor.arm_state("left") == "holding"
 
 
-def at_tool() -> list[pin.SE3]:
-    """Return the only pose at which the streams of these tests may begin."""
-    return [TOOL]
-
-
-def unknown() -> list[pin.SE3]:
-    raise AssertionError("an arm that follows a stream needs no tool poses")
-
-
-def test_a_stream_may_move_anywhere_but_has_to_begin_at_the_tool_again_after_a_silence() -> None:
-    stream = TargetStream(StreamSettings())
-    assert stream.offer(TOOL, at_tool, 0.0) is None
-    assert stream.offer(raised(TOOL, 0.2), unknown, 0.1) is None
-    assert stream.pose == raised(TOOL, 0.2)
-    assert stream.expire(0.5)
-    refusal = stream.offer(raised(TOOL, 0.2), at_tool, 0.5)
-    assert refusal is not None
-    assert (refusal.kind, refusal.detail["distance"]) == (SupervisionReason.STREAM_AWAY, pytest.approx(0.2))
-    assert not stream.following
-
-
 def test_targets_are_not_followed_any_more_when_a_reason_forbids_it(world: World) -> None:
     tool = world.engage()
     world.supervisor.paused = True
     assert kinds(world.supervisor.update_target("left", tool, world.now)) == "controller_paused"
     assert not world.supervisor.follows("left")
-
-
-def test_a_stream_that_began_away_from_the_tool_is_followed_after_a_jump_to_the_tool_or_a_silence() -> None:
-    passing, jumping, silent = (TargetStream(StreamSettings()) for _ in range(3))
-    for step in range(100):
-        assert passing.offer(raised(TOOL, 0.5 - 0.01 * step), at_tool, 0.01 * step) is not None
-    assert passing.pose is None
-    for stream in (jumping, silent):
-        assert stream.offer(raised(TOOL, 0.2), at_tool, 0.0) is not None
-    assert jumping.offer(TOOL, at_tool, 0.01) is None
-    assert silent.offer(raised(TOOL, 0.04), at_tool, 0.01) is not None
-    assert silent.offer(TOOL, at_tool, 0.02) is not None  # This motion to the tool is too slow to count as a jump.
-    assert not silent.expire(0.2)  # It ends a stream that the arm did not follow.
-    assert silent.offer(TOOL, at_tool, 0.2) is None
-
-
-def test_after_drop_a_target_stream_is_refused_until_reset_even_if_its_target_equals_the_tool_pose() -> None:
-    stream = TargetStream(StreamSettings())
-    assert stream.offer(TOOL, at_tool, 0.0) is None
-    stream.drop()
-    assert stream.offer(TOOL, at_tool, 0.01) is not None
-    stream.reset()
-    assert stream.offer(TOOL, at_tool, 0.02) is None
 
 
 def test_the_loss_of_the_receiver_of_commands_is_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:

@@ -28,9 +28,7 @@ def test_another_thread_marks_the_event_and_only_the_loop_wakes_its_waiters() ->
         event._waiters = Guarded()  # type: ignore[assignment]
         waiter = asyncio.ensure_future(event.wait())
         await asyncio.sleep(0)
-        thread = threading.Thread(target=event.set)
-        thread.start()
-        thread.join()
+        await asyncio.get_running_loop().run_in_executor(None, event.set)
         marked = [event.is_set(), waiter.done()]
         event.set()
         return [*marked, await asyncio.wait_for(waiter, 60.0)]

@@ -21,9 +21,9 @@ _RETRY = 1.0  # Time between two attempts to open a device again [s].
 # Number of successive reads that may fail. Buses of hobby servos lose single answers. A hand without a new pose moves
 # no arm, and after ``teleop.gate.timeout`` its arm stops, so it is safe to wait for further reads.
 _FAILURES = 5
-# A device whose read lasts longer than this [s] while the loop polls does not answer. Serial ports and libraries of
-# devices can wait for ever. At most _LONGEST_POLL [s] count between two polls, so that a pause of the loop does not
-# count as a fault of the device.
+# If a read of a device lasts longer than _LONGEST_READ [s], the device counts as lost. Without this limit, no arm would
+# stop if a serial port or a library waits for ever. Of the time between two polls of the input at most _LONGEST_POLL
+# [s] count, so that a pause of the loop is no fault of the device.
 _LONGEST_READ, _LONGEST_POLL = 1.0, 0.1
 _LONGEST_CLOSE = 2.0  # Longest time to wait at the end of a run for a device that does not answer [s].
 

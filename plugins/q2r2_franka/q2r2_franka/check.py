@@ -94,10 +94,11 @@ def main(arguments: list[str]) -> int:
         return 2
     try:
         checked = check_commands(entries_of(Path(arguments[0])))
-    except (IndexError, KeyError):  # There is no such arm, or no motion has begun before a command.
+    except (IndexError, KeyError):  # An entry names an arm that does not exist, or no motion has begun before it.
         checked = {}
     if not any(its.commands for its in checked.values()):
-        print(f"{arguments[0]}: no commands; allowed: a file of plant_settings.franka.record", file=sys.stderr)
+        allowed = "allowed: a file of plant_settings.franka.record"
+        print(f"{arguments[0]}: no commands, or an entry that cannot be read; {allowed}", file=sys.stderr)
         return 2
     for arm, its in checked.items():
         shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in its.shares.items())

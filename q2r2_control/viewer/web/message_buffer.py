@@ -13,8 +13,9 @@ class LoopEvent(asyncio.Event):
     """An event whose waiters are woken only in the thread of their loop.
 
     viser sets the event of a new message twice: at once, in the thread that writes the message, and then in the
-    thread of the loop. The first call of ``asyncio.Event.set`` would go through the waiters while the loop may change
-    them, and raise a RuntimeError. Here the first call only marks the event as set, and the second call wakes.
+    thread of the loop. In the first call, ``asyncio.Event.set`` would go through the waiters while the loop may change
+    them, and raise a RuntimeError. Here the first call only marks the event as set, and the second call wakes the
+    waiters.
     """
 
     def set(self) -> None:
@@ -28,7 +29,7 @@ class LoopEvent(asyncio.Event):
 
 
 class MessageBuffer(AsyncMessageBuffer):
-    """viser's buffer with a :class:`LoopEvent`."""
+    """viser's buffer of messages. Its event is a :class:`LoopEvent`."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings, message_event=LoopEvent())
